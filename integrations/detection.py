@@ -20,7 +20,7 @@ from lidar_synth.integrations.nuscenes import (
 )
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND, IGNORE
+from lidar_synth.datasets.classes import GROUND, has_ground
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import write_file
 from lidar_synth.formats.calibration import Calibration
@@ -45,17 +45,16 @@ def ground_plane(scan: Scan) -> NDArray[np.float64]:
     """Fit the ground plane: (4,) a, b, c, d in the sensor frame, with (a, b, c) of length 1 and
     pointing up.
 
-    It is fitted to the returns with ground labels, or without labels to the lowest return in each
-    square of 2 m; returns farther than 0.3 m from the plane are outliers.
+    It is fitted to the returns with ground labels, or without such labels to the lowest return in
+    each square of 2 m; returns farther than 0.3 m from the plane are outliers.
 
     Raises:
         DataError: if there is no ground.
     """
-    near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < NEAR
-    points = scan.points[near].astype(np.float64)
-    label = None if scan.label is None else scan.label[near]
-    if label is not None and (label != IGNORE).any():
-        points = points[GROUND[label]]
+    near = scan[np.hypot(scan.points[:, 0], scan.points[:, 1]) < NEAR]
+    points = near.points.astype(np.float64)
+    if has_ground(near.label):
+        points = points[GROUND[near.label]]
     elif len(points):
         points = _lowest(points)
     fit = np.array([0, 0, np.median(points[:, 2])]) if len(points) else np.zeros(3)
@@ -105,30 +104,6 @@ def plane_in_camera(
     """(4,) a plane of the sensor frame, transformed to the camera frame."""
     moved: NDArray[np.float64] = plane @ camera.sensor_from_camera
     return moved
-
-
-def in_view(scan: Scan, camera: Calibration) -> Scan:
-    """Crop a scan to a camera's image: the points and the boxes whose centres project into it.
-
-    Raises:
-        DataError: if the camera's image size is unknown.
-    """
-    size = camera.image_size
-    if size is None:
-        raise DataError("a camera without image size", "width and height, from image_2")
-
-    def seen(points: NDArray[np.float32]) -> NDArray[np.bool_]:
-        pixels, depth = camera.pixels(points)
-        with np.errstate(invalid="ignore"):
-            inside: NDArray[np.bool_] = (
-                (pixels >= 0).all(1) & (pixels < np.array(size)).all(1) & (depth > 0)
-            )
-        return inside
-
-    part = scan[seen(scan.points)]
-    if scan.boxes is not None:
-        part.boxes = scan.boxes[seen(scan.boxes.values[:, :3])]
-    return part
 
 
 def difficulty(boxes: Boxes) -> NDArray[np.int32]:

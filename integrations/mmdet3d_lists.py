@@ -15,14 +15,13 @@ import numpy as np
 from lidar_synth.integrations.detection import (
     difficulty,
     ground_plane,
-    in_view,
     plane_in_camera,
 )
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats import KITTIObject, SemanticKITTI
-from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.calibration import Calibration, in_view
 from lidar_synth.formats.kitti_labels import boxes_to_camera
 from lidar_synth.geometry.scan import Boxes, Scan
 
@@ -37,6 +36,24 @@ CLASSES = (
     "Misc",
 )
 """The classes of ``KittiDataset``, in its order."""
+OTHER = -1
+"""The label of ``DontCare`` and of all other names, which the trainer leaves out of training. Its
+evaluation calls them ``DontCare``, and excuses detections in their image boxes."""
+DONT_CARE = {
+    "bbox_label": OTHER,
+    "bbox_3d": [-1000.0, -1000.0, -1000.0, -1.0, -1.0, -1.0, -10.0],
+    "bbox_label_3d": OTHER,
+    "depth": -1000.0,
+    "num_lidar_pts": -1,
+    "difficulty": -1,
+    "truncated": -1.0,
+    "occluded": -1,
+    "alpha": -10.0,
+    "score": 0.0,
+    "index": -1,
+}
+"""An instance of a ``DontCare`` region, with the values of KITTI's label files for what it does not
+have."""
 ORDERS = ("uniform", "sequential")
 
 
@@ -101,7 +118,7 @@ def kitti_list(
     ``<root>/training/<points>``.
 
     ``velodyne_reduced`` is written if it is missing. The ground plane is that of ``planes``, or
-    fitted to the scan.
+    fitted to the scan. ``DontCare`` regions are instances, as the trainer's evaluation needs them.
 
     Args:
         root: the folder that holds ``training`` and ``ImageSets``.
@@ -141,9 +158,8 @@ def kitti_list(
             else plane_in_camera(ground_plane(scan), camera)
         )
         entries.append(_entry(frame, scan, seen, camera) | {"plane": plane.tolist()})
-    return write_list(
-        out, "KITTI", entries, {name: i for i, name in enumerate(CLASSES)}
-    )
+    categories = {name: i for i, name in enumerate(CLASSES)} | {"DontCare": OTHER}
+    return write_list(out, "KITTI", entries, categories)
 
 
 def read_plane(path: Path) -> Any:
@@ -190,7 +206,7 @@ def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, 
     levels = difficulty(boxes)
     found = []
     for i, name in enumerate(boxes.names):
-        label = CLASSES.index(name) if name in CLASSES else -1
+        label = CLASSES.index(name) if name in CLASSES else OTHER
         # Place, length, height, width, turn.
         box = [*floor[i], size[i, 2], size[i, 0], size[i, 1], turn[i]]
         facts = {
@@ -213,6 +229,8 @@ def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, 
             {k: np.asarray(v).tolist() for k, v in facts.items()}
             | {"score": 0.0, "index": i, "group_id": i}
         )
+    for rectangle in boxes.dont_care.tolist():
+        found.append(DONT_CARE | {"bbox": rectangle, "group_id": len(found)})
     return found
 
 

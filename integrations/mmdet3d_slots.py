@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from lidar_synth.integrations.detection import in_view
 from lidar_synth.integrations.mixture import (
     class_ids,
     id_table,
@@ -31,7 +30,7 @@ from torch.utils.data import get_worker_info
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_text
-from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.calibration import Calibration, in_view
 from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.mixing import Synthetic, make_synthetic

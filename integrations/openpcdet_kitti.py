@@ -4,14 +4,14 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.detection import ground_plane, in_view, plane_in_camera
+from lidar_synth.integrations.detection import ground_plane, plane_in_camera
 from lidar_synth.integrations.mixture import points_of
 from lidar_synth.integrations.mmdet3d_lists import CLASSES
 from lidar_synth.integrations.openpcdet_mixture import MixedDetection
 from pcdet.datasets.kitti.kitti_dataset import KittiDataset
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.formats.calibration import Calibration, homogeneous
+from lidar_synth.formats.calibration import Calibration, homogeneous, in_view
 from lidar_synth.geometry.scan import Scan
 
 

@@ -53,8 +53,8 @@ def write_plan(
 
     Raises:
         ConfigError: on synthetic scans that are not in a bank, a label policy that needs more than
-            the bank's own labels, no epochs or real samples, or settings that ``MixedScans``
-            refuses.
+            the bank's own labels, a recipe by ``epochs``, another sensor, an augmentation, no
+            epochs or real samples, or settings that ``MixedScans`` refuses.
         FileError: if the file cannot be written.
     """
     policy = read_policy(settings.get("labels", "generated"))
@@ -66,13 +66,14 @@ def write_plan(
             "The reader takes a bank's own labels; other policies need the package in the "
             "trainer's environment.",
         )
-    if settings.get("as_sensor") is not None:
-        raise ConfigError(
-            f"as_sensor: {settings['as_sensor']} for a plan file",
-            "none",
-            "The reader takes a bank's scans as they are; other sensors need the package in the "
-            "trainer's environment.",
-        )
+    for key in ("epochs", "as_sensor", "augment"):
+        if settings.get(key) is not None:
+            raise ConfigError(
+                f"{key}: {settings[key]} for a plan file",
+                "none",
+                "The reader takes a bank's scans as they are; recipes, other sensors and "
+                "augmentations need the package in the trainer's environment.",
+            )
     if epochs < 1 or real < 1 or Path(out).suffix != ".npz":
         raise ConfigError(
             f"{real} real samples and {epochs} epochs in {out}",

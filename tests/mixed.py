@@ -11,7 +11,7 @@ from lidar_synth.mixing import MixedScans
 
 
 def shift(scan: Scan, rng: np.random.Generator) -> Scan:
-    """An augmentation that draws."""
+    """An augmentation that draws, and makes a new scan without a domain."""
     return Scan(
         scan.points + rng.standard_normal(3).astype(np.float32),
         scan.reflectance,
@@ -19,7 +19,6 @@ def shift(scan: Scan, rng: np.random.Generator) -> Scan:
         scan.label,
         confidence=scan.confidence,
         id=scan.id,
-        domain=scan.domain,
     )
 
 

@@ -22,7 +22,7 @@ from small_models import write as write_pixel_model
 
 from lidar_synth import Town, adapt, load_generator, load_sensor, open_scans
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.datasets.recordings import seen_by
+from lidar_synth.datasets.recordings import Recordings, seen_by
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, layout_of
 from lidar_synth.generate.checkpoint import (
@@ -36,6 +36,7 @@ from lidar_synth.generate.checkpoint import (
     read_header,
     save_checkpoint,
 )
+from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
@@ -50,7 +51,10 @@ from lidar_synth.lab.train.adaptation.regrid import (
     fit_grid,
     regrid,
 )
-from lidar_synth.lab.train.adaptation.stages import TOWN_SEED
+from lidar_synth.lab.train.adaptation.run import plan_adaptation
+from lidar_synth.lab.train.adaptation.scans import Prepared
+from lidar_synth.lab.train.adaptation.stages import TOWN_SEED, Work, stages_for
+from lidar_synth.lab.train.config import DistillConfig
 from lidar_synth.lab.train.held_out import read_history
 
 TINY = load_sensor(Path(__file__).parent.parent / "configs" / "tiny_sensor.yaml")
@@ -408,6 +412,29 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(
         float(line.split()[1]) for line in text.splitlines() if line.startswith("  ")
     ) == pytest.approx(60, 0.01)
     assert list(tmp_path.iterdir()) == []
+    start = load_checkpoint(model)
+    known = replace(start.header, other_grids=((1.0, 0.5, 0.2, 0.0), (1.0, 0.0)))
+    several = tmp_path / "several.safetensors"
+    save_checkpoint(several, known, start.networks)
+    assert (
+        "a student of 2 steps: the times of 3 and 1 steps, which several knows, are lost"
+        in str(plan_adaptation(several, scans, out))
+    )
+
+
+@pytest.mark.parametrize("steps", [3, 50])
+def test_a_model_of_many_steps_is_given_the_times_of_a_student(
+    model: Path, tmp_path: Path, steps: int
+) -> None:
+    header = replace(load_checkpoint(model).header, time_grid=uniform_grid(steps))
+    prepared = Prepared(tmp_path, True, (), (), Recordings())
+    work = Work(tmp_path, header, prepared, "MIT", 0, stages_for(header, True, 0), {})
+    made = work.config("student", model)
+    assert isinstance(made, DistillConfig)
+    if steps == 3:
+        assert (made.grid, made.intervals) == (header.time_grid, 3)
+    else:
+        assert (made.grid, made.intervals) == (None, 4)  # they are selected
 
 
 @pytest.mark.slow

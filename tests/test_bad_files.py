@@ -341,3 +341,11 @@ def test_a_range_image_of_another_sensor(tmp_path: Path) -> None:
     np.save(tmp_path / "image.npy", np.ones((32, 1024), "f4"))
     with pytest.raises(DataError, match=r"shape \(32, 1024\); expected \(64, 1024\)"):
         open_scans(tmp_path / "image.npy", sensor="hdl64e_kitti")[0]
+
+
+@pytest.mark.parametrize("unit", [1000, 500, 100])
+def test_a_range_image_in_another_unit(tmp_path: Path, unit: int) -> None:
+    distance = unit * np.random.default_rng(0).uniform(2, 60, (64, 1024))
+    np.save(tmp_path / "image.npy", distance.astype(np.uint16))
+    with pytest.raises(DataError, match="exceed the 80 m of 'hdl64e_kitti'.*unit"):
+        open_scans(tmp_path / "image.npy", sensor="hdl64e_kitti")[0]

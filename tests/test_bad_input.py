@@ -278,7 +278,7 @@ def test_wrong_splits(tmp_path: Path) -> None:
     ):
         open_scans(tmp_path / "kitti_object", split="training")
     with pytest.raises(
-        ConfigError, match="split 'train' of .*layout 'kitti_raw' has none"
+        ConfigError, match="split='train' for .*layout 'kitti_raw' has none$"
     ):
         open_scans(tmp_path / "kitti_raw", split="train")
     with pytest.raises(DataError, match=r"no sequence of split 'val' \(it has 00\)"):

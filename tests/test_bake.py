@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import os
 import re
 import shutil
 import subprocess
@@ -30,13 +31,21 @@ from lidar_synth.bake import (
     bake,
     make_plan,
 )
-from lidar_synth.bake.folder import finish, prepare, write_bank_files
+from lidar_synth.bake.folder import (
+    _with_conditions_at,
+    at_work,
+    check_settings,
+    finish,
+    prepare,
+    write_bank_files,
+)
 from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.repair import repair
-from lidar_synth.bake.verify import regenerate
+from lidar_synth.bake.verify import regenerate, verify
 from lidar_synth.bank import INDEX, Bank, Encoding, Entry, Index
 from lidar_synth.bank.card import CARD, CROISSANT
 from lidar_synth.cli import app
+from lidar_synth.cli.bake import _resources
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.files.disk import sha256
 from lidar_synth.formats import open_scans
@@ -176,6 +185,38 @@ def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
     }
 
 
+def test_conditions_may_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_all("npz", Path("real"), [some_scan(i) for i in range(3)])
+    model = write_conditioned(tmp_path / "semantic.safetensors")
+    options: dict[str, Any] = {"count": 4, "shard_size": 2}
+    plan = plan_in(tmp_path / "bank", model, condition="real", **options)
+    assert plan.job.condition == str(tmp_path / "real")
+    bake(plan, share=Share(0, 2), progress=False)
+    # an earlier version kept the path as it was typed
+    old = _with_conditions_at(replace(plan, out=tmp_path / "old"), "real")
+    bake(old, share=Share(0, 2), progress=False)
+    Path("real").rename("moved")
+    Path("elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    for out, known in ((plan.out, str(tmp_path / "real")), (old.out, "real")):
+        moved = plan_in(out, model, condition="../moved", **options)
+        assert bake(moved, progress=False) is not None
+        assert verify(out, progress=False) == []
+        facts = Bank(out).facts
+        assert (facts.condition or {})["source"] == facts.settings["condition"] == known
+        with pytest.raises(FileError, match="real does not exist"):
+            regenerate(out, str(model), progress=False)
+        again = regenerate(out, str(model), progress=False, condition="../moved")
+        assert min(again.values()) == 1
+        (out / "shard-00001.h5").unlink()
+        done = repair(out, str(model), progress=False, condition="../moved")
+        assert done == {"shard-00001.h5": "regenerated"}
+        write_all("npz", tmp_path / "other", [some_scan(i) for i in range(2)])
+        with pytest.raises(ConfigError, match="'condition_content'"):
+            bake(plan_in(out, model, condition="../other", **options), progress=False)
+
+
 # The same bytes
 
 
@@ -262,6 +303,39 @@ def test_a_missing_library_of_an_engine_is_reported(
         match=rf"engine '{engine}', but .* pip install 'lidar_synth\[{engine}\]'",
     ):
         bake(plan, engine, progress=False)
+    assert list(plan.out.iterdir()) == []  # the corrected call may use it
+
+
+def test_a_bake_that_fails_before_its_first_shard_leaves_no_claim(
+    plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="device 'cuda'; expected an available one"):
+        bake(plan_in(plan.out, model, device="cuda"), progress=False)
+    assert not plan.out.exists()
+
+    def fail(*arguments: object) -> None:
+        raise FileError("no more")
+
+    monkeypatch.setitem(ENGINES, "local", fail)
+    with pytest.raises(FileError, match="no more"):
+        bake(plan_in(plan.out, model, steps=1), progress=False)
+    assert list(plan.out.iterdir()) == []
+    prepare(plan)
+    with at_work(plan), pytest.raises(FileError, match="no more"):
+        bake(plan, progress=False)
+    assert (plan.out / SETTINGS).is_file()  # another process needs it
+
+
+@pytest.mark.parametrize(("allowed", "workers"), [({3}, 1), ({0, 2, 5}, 3)])
+def test_there_is_one_worker_for_each_core_that_may_be_used(
+    plan: BakePlan,
+    allowed: set[int],
+    workers: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: allowed, raising=False)
+    assert _resources(plan, None, None, None).workers == workers
 
 
 def test_every_engine_is_named_in_the_help() -> None:
@@ -304,8 +378,10 @@ def test_a_different_setting_is_refused_and_shown(
 ) -> None:
     bake(plan, share=Share(0, 4), progress=False)
     before = {path: path.read_bytes() for path in plan.out.glob("*.h5")}
-    with pytest.raises(ConfigError, match=message):
-        bake(plan_in(plan.out, model, **change), progress=False)
+    other = plan_in(plan.out, model, **change)
+    for check in (bake, check_settings):
+        with pytest.raises(ConfigError, match=message):
+            check(other)
     assert before == {path: path.read_bytes() for path in plan.out.glob("*.h5")}
 
 
@@ -402,8 +478,9 @@ def test_invalid_options_are_refused(
     options: list[str], message: str, model: Path, tmp_path: Path
 ) -> None:
     call = ["bake", str(tmp_path / "bank"), "--model", str(model), *options]
-    with pytest.raises(ConfigError, match=message):
-        CliRunner().invoke(app, call, catch_exceptions=False)
+    for more in ([], ["--dry-run"]):
+        with pytest.raises(ConfigError, match=message):
+            CliRunner().invoke(app, [*call, *more], catch_exceptions=False)
     assert not (tmp_path / "bank").exists()
 
 
@@ -451,7 +528,7 @@ def test_unsuitable_models_are_refused(tmp_path: Path) -> None:
     assert plan_in(tmp_path / "bank", plain).facts.label_policy == "none"
     with pytest.raises(
         ConfigError,
-        match="condition here for model .*takes no condition; expected none",
+        match="condition .*here for model .*takes no condition; expected none",
     ):
         plan_in(tmp_path / "bank", plain, condition="here")
     with pytest.raises(
@@ -534,6 +611,7 @@ def test_a_dry_run_writes_nothing_and_estimates_the_size(
         and "scans/s" in output
         and "label policy" in output
     )
+    assert "MB of memory a worker for its shard" in output
     assert not out.exists()
     # The estimate is close to the actual size.
     actual = CliRunner().invoke(app, [*call[:-1]]).output

@@ -421,6 +421,49 @@ def test_a_bank_at_a_url_is_curated(
     assert len(list(tmp_path.glob("scores-*.npz"))) == 1
 
 
+BANK = "BANK"
+ELSEWHERE = "s3://mine/out"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("bank", "merge", ELSEWHERE, BANK),
+        ("bank", "head", BANK, ELSEWHERE, "--count", "1"),
+        ("bank", "split", BANK, f"{ELSEWHERE}=1"),
+        ("bank", "as-sensor", BANK, ELSEWHERE, "--sensor", "os1_128"),
+        ("convert", BANK, ELSEWHERE, "--to", "npz"),
+        ("curate", BANK, "--drop", "empty > 0.32", "--out", ELSEWHERE),
+        ("edit", "remove", BANK, ELSEWHERE, "--name", "Car"),
+        ("label", "kitti360", BANK, ELSEWHERE),
+        ("sample", ELSEWHERE, "--count", "1"),
+        ("town", ELSEWHERE, "--scans", "1"),
+        ("view", BANK, "--out", f"{ELSEWHERE}.png"),
+    ],
+    ids=" ".join,
+)
+def test_a_url_is_no_folder_to_write_to(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bank(tmp_path / "bank", [some_image(i) for i in range(4)])
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    given = [str(tmp_path / "bank") if word == BANK else word for word in words]
+    status, output = call(*given)
+    assert status == 2
+    assert "s3://mine/out" in output and "Only bake writes to URLs" in output
+    assert not list(Path().iterdir())
+
+
+def test_a_bank_at_a_url_is_converted_and_viewed(tmp_path: Path) -> None:
+    url = empty_memory()
+    write_bank(tmp_path / "bank", [some_image(i) for i in range(4)])
+    upload(tmp_path / "bank", url)
+    assert call("convert", url, tmp_path / "out", "--to", "npz")[0] == 0
+    assert len(open_scans(tmp_path / "out")) == 4
+    assert call("view", url, "--out", tmp_path / "one.html")[0] == 0
+
+
 # Faults of stores
 
 

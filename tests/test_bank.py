@@ -35,6 +35,7 @@ from lidar_synth.bank import (
     ShardReader,
     ShardWriter,
 )
+from lidar_synth.bank.card import card_files, croissant, summary
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.files.disk import sha256
 from lidar_synth.formats import WRITERS, BankScans, open_scans
@@ -371,6 +372,18 @@ def test_card_and_croissant(root: Path) -> None:
     assert files == {
         e.file: (e.sha256, f"{e.bytes} B") for e in Bank(root).index.shards
     }
+    assert described["license"] == "MIT"
+
+
+def test_cards_name_what_each_source_says(root: Path) -> None:
+    index = Bank(root).index
+    others = {"licence": "CC BY-NC-SA 4.0", "label_policy": "condition"}
+    sources = (*index.sources, replace(index.sources[0], **others))
+    index = replace(index, sources=sources)
+    assert summary(index)["label policy"] == "generated; condition"
+    assert croissant("mixed", index)["license"] == ["MIT", "CC BY-NC-SA 4.0"]
+    files = card_files("mixed", index, licence="cc-by-4.0")
+    assert json.loads(files["croissant.json"])["license"] == "cc-by-4.0"
 
 
 def test_the_golden_bank_is_still_read() -> None:

@@ -132,6 +132,11 @@ def test_settings_name_sensor_mount_and_scans_to_match(
             ConfigError, match="as_sensor: .*expected sensor: a preset's name"
         ):
             read_transfer(wrong, bank)
+    points = np.column_stack([bright.points, bright.reflectance * 255]).astype("<f4")
+    (tmp_path / "bytes").mkdir()
+    points.tofile(tmp_path / "bytes" / "0.bin")
+    with pytest.raises(DataError, match=r"convert .*bytes OUT --to npz --sensor"):
+        read_transfer(given | {"like": str(tmp_path / "bytes")}, bank)
     plain = mix_for_trainer(
         3,
         {"synthetic": bank, "as_sensor": {"sensor": "os1_128", "mount": [0.1, 0]}},

@@ -3,6 +3,7 @@
 import pickle
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,11 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.labels.augment import rotate_scan, yaw
-from lidar_synth.labels.compose import MIXES, MOVES
+from lidar_synth.labels.compose import MIXES, MOVES, make_augmentation
 from lidar_synth.mixing.settings import mix_for_trainer, read_settings
 from lidar_synth.noise import keyed_rng
 from lidar_synth.weather import CORRUPTIONS, Fog
-from lidar_synth.weather.corruption import SCATTERED
+from lidar_synth.weather.corruption import SCATTERED, SURFACE
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +67,30 @@ def test_the_probability_of_a_step_holds(scan: Scan) -> None:
 def test_a_corruption_is_plain_data() -> None:
     data = Compose([Fog(visibility=60)]).to_dict()
     assert data == {"compose": [{"fog": {"visibility": 60}}]}
+
+
+class OwnFog(Fog):
+    """A user's corruption."""
+
+    name = "own_fog"
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{name: {"severity": "heavy"}} for name in CORRUPTIONS] + [Fog(15), OwnFog(15)],
+    ids=str,
+)
+def test_a_box_that_loses_its_returns_is_no_target(scan: Scan, given: Any) -> None:
+    changed = make_augmentation(given, None, frozenset())(scan, rng())
+    assert scan.boxes is not None and changed.boxes is not None
+    surface = changed.points[changed.cause == SURFACE]
+    had = scan.boxes.contain(scan.points).any(1)
+    lost = had & ~scan.boxes.contain(surface).any(1)
+    kept = scan.boxes.values[~lost]
+    np.testing.assert_array_equal(changed.boxes.values, kept)
+    if isinstance(given, Fog):
+        alone = given(scan, rng()).boxes  # as a stress test applies it
+        assert lost.any() and alone is not None and len(alone) == len(scan.boxes)
 
 
 @pytest.mark.parametrize(

@@ -231,6 +231,7 @@ def test_several_sets_of_scans_follow_each_other() -> None:
         ("data.twon=1", "unknown key 'data.twon'; known there: licence, town"),
         ("recipe.batch=many", "recipe.batch = 'many'"),
         ("recipe.batch=0", "of at least 1"),
+        ("recipe.clip=0", "a rate and a clip above 0"),
         ("recipe.metric=l7", "one of squared_l2, pseudo_huber, l1"),
         ("recipe=null", "recipe = None"),
         ("normalisation=cubic", "normalisation 'cubic'; expected one of r2flow"),
@@ -247,6 +248,8 @@ def test_several_sets_of_scans_follow_each_other() -> None:
         ("network.architecture=resnet", "architecture 'resnet'; expected one of"),
         ("data.path=here", "data with town=40 and path=here; expected one of the two"),
         ("data.town=null", "expected one of the two"),
+        ("rehearsal={licence: MIT}", "expected one of the two"),
+        ("data.more=[{licence: MIT}]", "expected one of the two"),
         ("precision=fp8", "precision = 'fp8'"),
         ("batch", "override 'batch'; expected key=value"),
         ("seed.x=1", "seed is a single value"),
@@ -257,6 +260,17 @@ def test_what_cannot_be_is_refused(override: str, message: str) -> None:
     start = ["seed=0"] if override.startswith("seed.") else []
     with pytest.raises(ConfigError, match=message):
         load_config(TrainConfig, TINY, [*start, override])
+
+
+@pytest.mark.parametrize("key", ["warmup", "ema_after"])
+def test_a_run_that_ends_before_its_recipe_begins_is_warned_of(
+    key: str, recwarn: pytest.WarningsRecorder
+) -> None:
+    given = ["recipe.iterations=50", f"recipe.{key}=49"]
+    load_config(TrainConfig, TINY, given)
+    assert not recwarn
+    with pytest.warns(UserWarning, match=rf"recipe.{key}=50 with recipe.iterations=50"):
+        load_config(TrainConfig, TINY, [*given, f"recipe.{key}=50"])
 
 
 @pytest.mark.parametrize(

@@ -425,6 +425,14 @@ def test_other_options_of_the_reader_do_not_keep_the_old_scans(tmp_path: Path) -
         )
 
 
+def test_a_folder_is_not_converted_into_itself(tmp_path: Path) -> None:
+    write_all("kitti", tmp_path, [some_scan(0)])
+    before = files(tmp_path)
+    with pytest.raises(ConfigError, match="source and output; expected another folder"):
+        convert(open_scans(tmp_path), WRITERS["kitti"](tmp_path), progress=False)
+    assert files(tmp_path) == before and not (tmp_path / SETTINGS).exists()
+
+
 def five_fields(folder: Path, *counts: int) -> Path:
     """Files of five numbers per point, whose sizes show it with an odd number of points."""
     folder.mkdir()

@@ -2,6 +2,7 @@
 scans."""
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -344,6 +345,19 @@ def test_scores_of_another_bank_are_not_reused(bank: Path) -> None:
         len(read_scores(bank / FILE).twin) == 3
         and read_scores(bank / FILE).bank == Bank(bank).identity
     )
+
+
+def test_scores_of_a_read_only_bank_are_saved_here(
+    bank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = sorted(bank.iterdir())
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != bank)
+    told = [call("curate", bank, "--json") for _ in range(2)]
+    assert told[0] == told[1] and sorted(bank.iterdir()) == before
+    [saved] = Path().iterdir()
+    assert read_scores(saved).bank == Bank(bank).identity
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ keep the curation."""
 
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import hypothesis.strategies as st
 import numpy as np
@@ -160,6 +161,26 @@ def test_parts_of_a_curated_bank_are_curated(
     )
     assert head(Bank(good), 3, tmp_path / "head", progress=False).scans == 3
     assert names_and_points(tmp_path / "head") == names_and_points(good)[:3]
+
+
+@settings(max_examples=25)
+@given(kept=st.sets(st.integers(0, 7), min_size=1, max_size=7))
+def test_curated_banks_that_share_no_scan_are_merged(
+    original: Path, kept: set[int]
+) -> None:
+    """Whichever scans of the same shards they hold."""
+    rest = {*range(8)} - kept
+    with TemporaryDirectory() as folder:
+        one, other, both, merged = (Path(folder, name) for name in "abcd")
+        drop(Bank(original), rest, "one", one, progress=False)
+        drop(Bank(original), kept, "other", other, progress=False)
+        merge([Bank(one), Bank(other)], merged, progress=False)
+        assert verify(merged, progress=False) == []
+        assert names_and_points(merged) == names_and_points(one, other)
+        shared = min(kept)
+        drop(Bank(original), kept - {shared}, "both", both, progress=False)
+        with pytest.raises(ConfigError, match=f"both hold scan {shared} of seed 0"):
+            merge([Bank(one), Bank(both)], Path(folder, "none"), progress=False)
 
 
 def test_a_part_of_a_shard_keeps_its_dropped_scans(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from streets import street
+from streets import kitti, street
 from typer.testing import CliRunner
 
 from lidar_synth import Boxes, Scan
@@ -22,7 +22,7 @@ from lidar_synth.lab.proof.detection.arms import make_mixture
 from lidar_synth.lab.proof.detection.bev import CHANNELS, Found
 from lidar_synth.lab.proof.detection.network import Detector, detect
 from lidar_synth.lab.proof.detection.scores import Criterion, Truth, judge, precision_of
-from lidar_synth.lab.proof.detection.study import half_of
+from lidar_synth.lab.proof.detection.study import DetectionWork, half_of
 from lidar_synth.lab.proof.detection.summary import interval_of, summarise
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -188,6 +188,26 @@ def test_a_comparison_from_scans_to_page(places: Path, tmp_path: Path) -> None:
             DetectionSettings(2, ("first",), 10, 1, synthetic=2),
             pools=pool,
         )
+
+
+def test_kittis_objects_are_learnt_in_the_cameras_view(tmp_path: Path) -> None:
+    root = kitti(tmp_path / "k", 4)
+    (root / "testing").mkdir()
+    (root / "testing" / "velodyne").symlink_to(root / "training" / "velodyne")
+    command = ["prove", str(root), "--task", "detection", "--dry-run"]
+    result = CliRunner().invoke(app, [*command, "--places", "stretch:2"])
+    assert "4 scans in 2 places" in result.output
+    result = CliRunner().invoke(app, command)
+    assert isinstance(result.exception, DataError)
+    assert "mapping/ of the devkit" in str(result.exception)
+
+
+def test_of_a_larger_pool_the_first_scans_are_taken(tmp_path: Path) -> None:
+    for i in range(3):
+        write_scan(tmp_path / f"{i:06d}.npz", street(10 + i))
+    settings = DetectionSettings(synthetic=2)
+    town = DetectionWork([street(0)], settings, tmp_path / "out", tmp_path).town
+    assert [town[i].id for i in range(len(town))] == ["000000", "000001"]
 
 
 def test_scans_without_boxes_are_refused(tmp_path: Path) -> None:

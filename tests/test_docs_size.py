@@ -17,7 +17,7 @@ LIMITS = {
     "docs/how-to/choose.md": 168,
     "docs/explanation/comparison.md": 130,
     "docs/how-to/mix.md": 685,
-    "docs/how-to/trainers/index.md": 315,
+    "docs/how-to/trainers/index.md": 325,
     "docs/how-to/trainers/mmdetection3d.md": 230,
     "docs/how-to/trainers/openpcdet.md": 160,
     "docs/how-to/trainers/pointcept.md": 125,
@@ -65,7 +65,7 @@ LIMITS = {
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 9_000
+MAIN_PATH = 9_050
 """Words of all pages of docs/ on the main path."""
 
 PAGES = [

@@ -28,6 +28,7 @@ from lidar_synth.mixing import (
     defaults,
     make_schedule,
     settle,
+    to_item,
 )
 from lidar_synth.mixing.settings import mix_for_trainer
 
@@ -71,6 +72,17 @@ def test_batches_have_the_weights_in_the_order_of_their_domains(collate: Any) ->
     assert sorted(item["loss_weight"] for item in stream) == [0.25] * 4 + [1.0] * 4
 
 
+def test_dicts_with_the_values_of_an_item_have_its_weight() -> None:
+    def to_sample(scan: Scan, rng: np.random.Generator) -> dict[str, Any]:
+        return {**to_item(scan, rng), "first": scan.points[0]}
+
+    mixed = MixedScans(REAL, SYNTHETIC, 0.5, loss_weight=0.25, to_sample=to_sample)
+    [batch] = mixed.loader(8)
+    expected = [mixed.loss_weight(i) for i in range(8)]
+    assert batch["loss_weight"].tolist() == expected
+    assert set(expected) == {0.25, 1.0}
+
+
 def test_a_weighted_loss_moves_the_network_as_far_as_its_weights() -> None:
     mixed = MixedScans(REAL, SYNTHETIC, 0.5, loss_weight=0.1, collate="padded")
     scale = torch.ones(1, requires_grad=True)
@@ -87,8 +99,8 @@ def test_other_weights_are_refused(wrong: Any) -> None:
         MixedScans(REAL, SYNTHETIC, 0.5, loss_weight=wrong)
 
 
-@pytest.mark.parametrize("wrong", [[0.5], [0.5, -1], [0.5, 2]])
-def test_other_weights_of_sources_are_refused(wrong: list[float]) -> None:
+@pytest.mark.parametrize("wrong", [[0.5], [0.5, -1], np.array([0.5, 2])])
+def test_other_weights_of_sources_are_refused(wrong: Any) -> None:
     with pytest.raises(ConfigError, match="weight"):
         Sources(SYNTHETIC, SYNTHETIC, loss_weights=wrong)
 
@@ -180,6 +192,8 @@ def test_a_segmenters_default_ends_on_real_scans_where_they_are_many(
     assert "more than 24 labelled scans (25 here)" in caplog.text
     assert some.mixture.ratio(5) == 1
     assert ratios(mix([REAL[0]] * 41, SYNTHETIC, epochs=8)) == QUARTER
+    with pytest.raises(ConfigError, match="3 epochs.*at least 4"):
+        mix([REAL[0]] * 41, SYNTHETIC, epochs=3)
 
 
 def test_a_segmenters_default_needs_labels() -> None:
@@ -248,6 +262,19 @@ def test_each_domain_has_its_layer_and_its_statistics() -> None:
     assert torch.allclose(layer(x), expected)
 
 
+def test_points_of_a_batch_need_a_domain_each() -> None:
+    layer = ByDomain(torch.nn.Linear(4, 8))
+    batch = next(iter(MixedScans(REAL, SYNTHETIC, 0.5).loader(4)))
+    layer.domain = batch["domain"]
+    with pytest.raises(ConfigError, match=r"4 domains for.*repeat_interleave"):
+        layer(batch["points"])
+    layer.domain = batch["domain"].repeat_interleave(batch["offsets"].diff())
+    out = layer(batch["points"])
+    start = int(batch["offsets"][3])
+    last = layer.layers[int(batch["domain"][3])]
+    assert torch.allclose(out[start:], last(batch["points"][start:]), atol=1e-5)
+
+
 def test_reflectance_is_dropped_by_chance() -> None:
     rng = np.random.default_rng(0)
     scan = REAL[0]
@@ -256,6 +283,24 @@ def test_reflectance_is_dropped_by_chance() -> None:
     assert scan.reflectance.any()
     dropped = [drop_reflectance(scan, rng, 0.5) is not scan for _ in range(200)]
     assert 70 < sum(dropped) < 130
+
+
+def test_a_wrapped_dataset_gets_the_recipe_too() -> None:
+    """A trainer's settings with ``epochs`` are those of ``mix``, by the number of its samples."""
+    few = mix(REAL, SYNTHETIC, epochs=8)
+    settings = {"synthetic": SYNTHETIC, "epochs": 8}
+    for count, like in (
+        (len(REAL), few),
+        (41, mix([REAL[0]] * 41, SYNTHETIC, epochs=8)),
+    ):
+        made = mix_for_trainer(count, settings, to_item)
+        assert ratios(made) == ratios(like) and len(made) == len(like)
+    other = {"as_sensor": "vlp16"}
+    assert ratios(mix_for_trainer(4, settings | other, to_item)) == QUARTER
+    given = MixedScans.wrap(
+        range(4), SYNTHETIC, 0.25, to_sample=to_item, epochs=8, compare=False
+    )
+    assert given.mixture.ratio(0) == 0.25
 
 
 def test_the_recipe_for_detectors_has_synthetic_scans_first_and_pastes_objects() -> (
@@ -267,7 +312,10 @@ def test_the_recipe_for_detectors_has_synthetic_scans_first_and_pastes_objects()
     for epoch in (0, 5, 6, 7):
         mixed.set_epoch(epoch)
         shares.append(sum(mixed.domain(i) for i in range(len(mixed))))
-        boxes += [len(mixed[i]["boxes"]) for i in range(len(mixed))]
+        items = [mixed[i] for i in range(len(mixed))]
+        boxes += [len(item["boxes"]) for item in items]
+        domains = [mixed.domain(i) for i in range(len(mixed))]
+        assert [item["domain"] for item in items] == domains  # with pasted objects too
     assert shares == [4, 4, 2, 2]
     own = [len(scan.boxes) for scan in REAL + SYNTHETIC if scan.boxes is not None]
     assert np.mean(boxes) > np.mean(own)

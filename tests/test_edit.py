@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from lidar_synth import ObjectBank, Town, load_generator, load_sensor, open_scans
 from lidar_synth.cli import app
-from lidar_synth.datasets.classes import GROUND
+from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS
 from lidar_synth.geometry.projection import locate, project, unproject
@@ -44,22 +44,21 @@ def cells_of(scan: Scan, points: np.ndarray) -> np.ndarray:
     return hole
 
 
-@pytest.mark.parametrize("labelled", [True, False])
+@pytest.mark.parametrize("labels", ["all", "object", "none"])
 @pytest.mark.parametrize(
     "place", [(12, 2, 0.3), (9, -6, 1.4), (-14, 0.5, 0.1), (17, 5, 0.0)]
 )
 def test_behind_a_removed_car_is_what_was_there(
-    place: tuple[float, float, float], labelled: bool
+    place: tuple[float, float, float], labels: str
 ) -> None:
     full = cast([car(*place)], [BEHIND])
     empty = cast([], [BEHIND])
-    scan = (
-        full
-        if labelled
-        else replace(
-            full, label=None, instance=None, boxes=replace(full.boxes, instance=None)
-        )
+    labelled = labels == "all"
+    bare = replace(
+        full, label=None, instance=None, boxes=replace(full.boxes, instance=None)
     )
+    own = np.where(full.label == CAR, full.label, IGNORE).astype(np.uint8)
+    scan = {"all": full, "object": replace(bare, label=own), "none": bare}[labels]
     result = edit.remove(scan, 0)
     hole = cells_of(full, full.instance == 1)
     expected, label = returned(empty, hole)

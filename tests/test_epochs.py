@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader, DistributedSampler, RandomSampler, rand
 from lidar_synth.errors import ConfigError
 from lidar_synth.mixing import MixedScans, MixedStream
 from lidar_synth.mixing.epochs import Position
+from lidar_synth.mixing.state import make_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
@@ -195,6 +196,25 @@ def test_a_streams_persistent_workers_keep_it_or_raise() -> None:
     next(iterator)
     stream.set_epoch(2)
     refused(iterator, r"set_epoch\(2\) while .* epoch 1")
+
+
+@pytest.mark.parametrize("form", ["map", "stream"])
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
+def test_persistent_workers_of_a_copy_see_the_epoch(copied: Any, form: str) -> None:
+    train = mixed(9)
+    stream = MixedStream(train, batch_size=4, endless=False)
+    ours = copied(stream if form == "stream" else train)
+    loader = DataLoader(
+        ours, 4, num_workers=1, collate_fn=list, persistent_workers=True
+    )
+    for epoch in range(2):
+        ours.set_epoch(epoch)
+        assert samples(loader) == planned(train, epoch)
+    if form == "stream":
+        ours.load_state_dict(make_state(train.mixture, 2, 8))
+        assert samples(loader) == planned(train, 2)[8:]
 
 
 def test_indexing_by_hand_takes_the_epoch_that_is_set() -> None:

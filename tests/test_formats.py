@@ -114,8 +114,14 @@ def test_every_field_of_a_point_is_read_back(tmp_path: Path, to: str) -> None:
         ),
     ],
 )
-def test_clouds_of_other_programs(tmp_path: Path, suffix: str, header: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["intensity", "Intensity", "i", "remission", "scalar_Intensity"]
+)
+def test_clouds_of_other_programs(
+    tmp_path: Path, suffix: str, header: str, name: str
+) -> None:
     path = tmp_path / f"scan{suffix}"
+    header = header.replace("intensity", name)
     path.write_text(f"{header}1 2 3 51\n-4 5 6 255\n")
     scan = READERS["folder"](path, reflectance_max=255)[0]
     assert same(scan.points, [(1, 2, 3), (-4, 5, 6)])
@@ -367,6 +373,26 @@ def test_npy_and_other_fields_in_a_folder(tmp_path: Path) -> None:
     ):
         assert same(source[0].points, scan.points)
         np.testing.assert_allclose(source[0].reflectance, scan.reflectance, atol=1e-7)
+
+
+@pytest.mark.parametrize("to", ["kitti", "mcap", "range"])
+def test_links_to_folders_are_followed_but_not_in_circles(
+    tmp_path: Path, to: str
+) -> None:
+    write_all(to, tmp_path / "real", [some_scan()])
+    folder = tmp_path / "in"
+    (folder / "a").mkdir(parents=True)
+    for link, target in (
+        (folder / "b", tmp_path / "real"),
+        (folder / "circle", folder),
+        (folder / "a" / "up", tmp_path),
+        (folder / "a" / "missing", tmp_path / "missing"),
+        (tmp_path / "real" / "back", folder / "a"),
+    ):
+        link.symlink_to(target)
+    source = open_scans(folder)
+    assert type(source) is READERS[WRITTEN_AS[to]]
+    assert source.ids == ("b/000000",)
 
 
 @pytest.mark.parametrize("to", WRITERS)

@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from layouts import MAKERS, a_pose, some_boxes, some_camera, some_scan, write_all
 from roundtrips import back, same
+from streets import CAMERA, kitti
 
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.datasets.classes import KITTI360 as KITTI360_CLASSES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, open_scans
+from lidar_synth.formats.calibration import in_view
 from lidar_synth.formats.point_labels import decode_labels, encode_labels
 from lidar_synth.geometry.scan import Boxes, Scan
 
@@ -247,6 +249,53 @@ def test_kitti_object_lists_boxes_in_the_cameras_view(tmp_path: Path) -> None:
     assert read is not None and len(read) == 0 and len(read.dont_care) == 1
     with pytest.raises(ConfigError, match="split 'val'.*there is no"):
         KITTIObject(tmp_path, "val")
+
+
+def test_a_detector_gets_scans_with_boxes_in_the_view(tmp_path: Path) -> None:
+    root = kitti(tmp_path / "k", 3)
+    (root / "training" / "label_2" / "000001.txt").unlink()
+    scans = KITTIObject(root)
+    cropped = scans.with_boxes()
+    assert cropped.ids == ("training/000000", "training/000002")
+    assert len(scans) == 3 and scans.beyond_view and not cropped.beyond_view
+    for whole, part in ((scans[0], cropped[0]), (scans[2], cropped[1])):
+        assert same(part.points, in_view(whole, CAMERA).points)
+        assert 0 < len(part) < len(whole)
+    for path in (root / "training" / "label_2").iterdir():
+        path.unlink()
+    with pytest.raises(DataError, match="without boxes"):
+        scans.with_boxes()
+
+
+def test_an_object_that_the_images_edge_cuts_is_in_view() -> None:
+    """KITTI labels it: without its box, its points would be background."""
+    edge = 10 * CAMERA.projection[0, 2] / CAMERA.projection[0, 0]
+    scan = some_scan()
+    scan = Scan(
+        np.array([(10, edge - 0.1, 0), (10, edge + 0.5, 0)], np.float32),
+        np.zeros(2, np.float32),
+        scan.sensor,
+        boxes=Boxes(
+            np.array([(10, edge + d, 0, 4, 2, 2, 0) for d in (0.5, 3)]), ("Car", "Van")
+        ),
+    )
+    part = in_view(scan, CAMERA)
+    assert len(part) == 1
+    assert part.boxes is not None and part.boxes.names == ("Car",)
+
+
+def test_the_drives_of_shuffled_frames_are_the_devkits(tmp_path: Path) -> None:
+    root = kitti(tmp_path / "k", 3)
+    assert KITTIObject(root).drives is None
+    (root / "mapping").mkdir()
+    rows = [f"2011_09_26 2011_09_26_drive_{i:04d}_sync 0000000001" for i in (1, 2, 3)]
+    (root / "mapping" / "train_mapping.txt").write_text("\n".join(rows))
+    (root / "mapping" / "train_rand.txt").write_text("3,1,2")
+    drives = [f"2011_09_26_drive_{i:04d}_sync" for i in (3, 1, 2)]
+    assert KITTIObject(root).drives == tuple(drives)
+    (root / "mapping" / "train_rand.txt").write_text("3,1,9")
+    with pytest.raises(DataError, match=r"mapping.*devkit"):
+        _ = KITTIObject(root).drives
 
 
 @settings(max_examples=25)

@@ -160,7 +160,8 @@ def test_scans_with_boxes_get_the_town_with_boxes(tmp_path: Path) -> None:
         tmp_path / "scans", tmp_path / "out", scans=1, minutes=0, jobs=1
     )
     assert made is not None and "your objects pasted" in made.found[4]
-    assert 'task="detection"' in made.code
+    assert 'task="detection"' in made.code and ".with_boxes()" in made.code
+    assert "in unknown drives" in made.found[0] and "for 30 of 40" in made.found[4]
     town = lidar_synth.open_scans(tmp_path / "out" / "town")
     assert len(town) == 1 and town[0].boxes is not None and town[0].label is not None
 
@@ -237,6 +238,9 @@ def test_the_recipes_command_writes_a_trainers_files(tmp_path: Path) -> None:
     assert (
         settings["ratio"] == {"synthetic_first": 40} and settings["labels"] == "boxes"
     )
+    other = CliRunner().invoke(app, "recipes --trainer rangenet".split())
+    assert "# For a training of 40 epochs" in other.output
+    assert "epochs: 40\n" in other.output
     text = (tmp_path / "mixed" / "train.sh").read_text()
     assert f"LIDAR_SYNTH_MIX={tmp_path}/mixed/mix.yaml" in text
     assert "DATA_CONFIG.DATA_PATH KITTI" in text

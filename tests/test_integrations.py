@@ -16,10 +16,7 @@ import pytest
 import torch
 import yaml
 from banks import some_image, write_bank
-from lidar_synth.integrations.detection import (
-    check_names,
-    in_view,
-)
+from lidar_synth.integrations.detection import check_names
 from lidar_synth.integrations.folders import MANIFEST, export_mixture, write_planes
 from lidar_synth.integrations.mixture import (
     VARIABLE,
@@ -47,6 +44,7 @@ from torch.utils.data import DataLoader, Dataset
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.formats import KITTIObject, open_scans
+from lidar_synth.formats.calibration import in_view
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.labels.own import IgnoreLabels, RemoveLabels
 from lidar_synth.mixing import MixedScans
@@ -106,7 +104,7 @@ def test_settings_come_from_a_file_or_the_environment(
     monkeypatch.setenv(VARIABLE, str(path))
     assert read_settings() == read_settings(path) == read_settings(wanted) == wanted
     path.write_text("- 1")
-    with pytest.raises(ConfigError, match="a dict of synthetic, ratio"):
+    with pytest.raises(ConfigError, match="a dict of synthetic, epochs, ratio"):
         read_settings(path)
 
 
@@ -385,6 +383,24 @@ def test_lists_for_mmdetection3d(tmp_path: Path) -> None:
     for entry in json.loads(listed.read_text())["data_list"]:
         assert (tmp_path / "sk" / entry["lidar_points"]["lidar_path"]).is_file()
         assert (tmp_path / "sk" / entry["pts_semantic_mask_path"]).is_file()
+
+
+def test_a_list_for_mmdetection3d_has_the_regions_without_boxes(tmp_path: Path) -> None:
+    """Its evaluation names every instance by the list's categories, and excuses detections in
+    ``DontCare`` regions."""
+    root = kitti(tmp_path, 1)
+    file = root / "training" / "label_2" / "000000.txt"
+    region = "DontCare -1 -1 -10 10 20 30 40.5 -1 -1 -1 -1000 -1000 -1000 -10\n"
+    file.write_text(file.read_text().replace("Car", "Bus", 1) + region)
+    listed = json.loads(kitti_list(root, tmp_path / "k.json").read_text())
+    names = {number: n for n, number in listed["metainfo"]["categories"].items()}
+    found = listed["data_list"][0]["instances"]
+    labels = [names[each["bbox_label"]] for each in found]
+    assert labels == ["DontCare", "Car", "DontCare"]
+    excused = found[-1]
+    assert excused["bbox"] == [10, 20, 30, 40.5] and excused["bbox_label_3d"] == -1
+    assert excused["group_id"] == 2 and excused["index"] == -1
+    assert excused.keys() == found[0].keys()  # the trainer takes those of the first
 
 
 def test_urls_of_a_folder_of_scans(tmp_path: Path) -> None:

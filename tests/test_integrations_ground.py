@@ -18,21 +18,24 @@ from lidar_synth.integrations.mixture import (
 from mixtures import as_is
 from streets import CAMERA, held, street, synthetic
 
+from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import ObjectBank
 
 
-@pytest.mark.parametrize("labelled", [True, False])
-def test_the_ground_plane(labelled: bool) -> None:
+@pytest.mark.parametrize("labels", ["all", "objects", "none"])
+def test_the_ground_plane(labels: str) -> None:
+    """Pasting into an unlabelled scan leaves the labels of the objects alone."""
     scan = street(3)
+    assert scan.label is not None
+    objects = np.where(GROUND[scan.label], IGNORE, scan.label).astype(np.uint8)
+    known = {"all": scan.label, "objects": objects, "none": None}[labels]
     tilt = np.array([0.03, -0.02])
     lifted = scan.points + np.c_[
         np.zeros((len(scan), 2)), scan.points[:, :2] @ tilt
     ].astype(np.float32)
-    tilted = replace(
-        scan, points=lifted, label=scan.label if labelled else None, raw_label=None
-    )
+    tilted = replace(scan, points=lifted, label=known, raw_label=None)
     plane = ground_plane(tilted)
     normal = np.array([-tilt[0], -tilt[1], 1]) / np.linalg.norm([*tilt, 1])
     assert np.allclose(plane[:3], normal, atol=5e-3) and abs(plane[3] - 1.73) < 0.05
@@ -40,7 +43,7 @@ def test_the_ground_plane(labelled: bool) -> None:
     assert seen[1] < -0.99 and abs(seen[3] - 1.73) < 0.05
     on_it = (
         tilted.points[tilted.label == 8][0]
-        if labelled
+        if labels == "all"
         else (0, 0, -plane[3] / plane[2])
     )
     moved = CAMERA.camera_from_sensor @ [*on_it, 1]

@@ -234,6 +234,27 @@ def test_a_checkpoint_resumes_after_its_last_batch(
     assert kept + rest.seen == whole.seen
 
 
+def test_a_loader_resumes_within_an_epoch_and_later_epochs_are_whole(
+    tmp_path: Path,
+) -> None:
+    def loader() -> Any:
+        return MixedScans(Scans("r", 10), Endless(), ratio=0.25).loader(3)
+
+    whole = Model()
+    trainer(tmp_path, enable_checkpointing=False).fit(whole, loader())
+    saving = lightning.pytorch.callbacks.ModelCheckpoint(
+        tmp_path, "step", every_n_train_steps=1
+    )
+    first = Stopping(1, 3)
+    with pytest.raises(Stop):
+        trainer(tmp_path, callbacks=[saving]).fit(first, loader())
+    rest = Model()
+    trainer(tmp_path, enable_checkpointing=False).fit(
+        rest, loader(), ckpt_path=tmp_path / "step.ckpt"
+    )
+    assert first.seen + rest.seen == whole.seen
+
+
 def test_a_checkpoint_within_an_epoch_needs_steps_of_its_size() -> None:
     data = module.MixedData(MixedScans(Scans("r", REAL), Endless()), batch_size=2)
     state = make_state(data.train.mixture, 0, 4) | {"step": 4}

@@ -31,7 +31,7 @@ import lidar_synth.integrations.mmdet3d as adapter
 import mmdet3d
 import torch
 from layouts import write_all
-from lidar_synth.integrations.detection import in_view, write_gt_database
+from lidar_synth.integrations.detection import write_gt_database
 from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
 from lidar_synth.integrations.mmdet3d_slots import Folder, open_folder, read_url
@@ -47,6 +47,7 @@ from torch.utils.data import DataLoader
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats import open_scans
+from lidar_synth.formats.calibration import in_view
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import ObjectBank
 

@@ -33,7 +33,7 @@ import lidar_synth.integrations.openpcdet as adapter
 import pcdet
 import torch
 from layouts import write_all
-from lidar_synth.integrations.detection import in_view, write_gt_database
+from lidar_synth.integrations.detection import write_gt_database
 from lidar_synth.integrations.openpcdet import register
 from pcdet.datasets import __all__ as registered
 from pcdet.datasets.kitti import kitti_dataset
@@ -43,6 +43,7 @@ from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats import open_scans
+from lidar_synth.formats.calibration import in_view
 from lidar_synth.geometry.scan import Boxes
 from lidar_synth.labels import ObjectBank
 

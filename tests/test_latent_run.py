@@ -32,11 +32,13 @@ from lidar_synth.generate.checkpoint import (
     VELOCITY,
     join,
     load_checkpoint,
+    network_hash,
     read_header,
     save_checkpoint,
 )
 from lidar_synth.generate.loading import load_generator
-from lidar_synth.lab.train.config import DistillConfig, load_config
+from lidar_synth.lab.train.config import DistillConfig, TrainConfig, load_config
+from lidar_synth.lab.train.runs import open_stage
 from lidar_synth.lab.train.student import target_flow
 
 STILL = ("stem", "encode", "merge", "to_latent", "shift", "scale")
@@ -343,6 +345,22 @@ def test_a_decoder_goes_on_alone(
     assert len(
         load_generator(tmp_path / "more" / "more.safetensors").scans(0, [3], cond)[0]
     )
+
+
+def test_a_discriminator_follows_the_seed(
+    scans: Path, codec: Path, tmp_path: Path
+) -> None:
+    losses = {"adversarial": 0.1, "discriminator_width": 4}
+    path = write_config(scans, tmp_path, "more", network=CODEC_NETWORK, losses=losses)
+    zero, again, one = (
+        network_hash(
+            open_stage(
+                load_config(TrainConfig, path, [f"init={codec}", f"seed={seed}"])
+            ).network
+        )
+        for seed in (0, 0, 1)
+    )
+    assert zero == again != one
 
 
 def test_fine_tuning_a_latent_model(

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lidar_synth import Layout, Town, layout_of, load_layout, load_sensor
-from lidar_synth.datasets.classes import BOXED, LABELS
+from lidar_synth.datasets.classes import BOXED, IGNORE, LABELS
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.layout import CODES, Outline, layout_image, select_known_boxes
 from lidar_synth.geometry.layout.raster import depth_of
@@ -299,6 +299,8 @@ def test_a_scan_without_labels_has_ground_and_outlines(town: Any) -> None:
         "building",
         "vegetation",
     } and len(layout.outlines) > 20
+    objects = np.where(np.isin(town.label, BOXED), town.label, IGNORE).astype(np.uint8)
+    assert layout_of(replace(bare, label=objects)).ground == layout.ground
     with pytest.raises(DataError, match="has no boxes"):
         layout_of(replace(town, boxes=None))
     with pytest.raises(DataError, match="returns of the ground"):

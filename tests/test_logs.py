@@ -1,6 +1,8 @@
 """PCD logs as the vendors' drivers write them reach a fitted sensor, a picture and a mixture by one
 command each."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ from logs import LOGS, axes, turn_time, write_log
 from test_fit_sensor import run
 
 from lidar_synth import MixedScans, load_sensor, open_scans
+from lidar_synth.formats.folder import rows_of_rings
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.town import Town
 
@@ -55,6 +58,79 @@ def test_a_log_reaches_a_sensor_a_picture_and_a_mixture(
     assert read.time is not None and np.allclose(
         read.time - read.time.min(), since, atol=1e-6
     )
+
+
+def rays(count: int = 128) -> Scan:
+    """A return of each ray of a sensor with dense beams, with the row as ring."""
+    sensor = replace(load_sensor("os1_128"), columns=count)
+    points = 20 * sensor.ray_directions().reshape(-1, 3)
+    ring = np.repeat(np.arange(sensor.shape[0], dtype=np.int16), count)
+    return Scan(points, np.full(len(points), 0.5, np.float32), sensor, ring=ring)
+
+
+@pytest.mark.parametrize(("pitch", "lost"), [(0.0, 0.6), (0.5, 0.0), (2.0, 0.0)])
+@pytest.mark.filterwarnings("ignore:scan a of")  # that it is tilted
+def test_each_ring_of_a_log_gets_its_own_row(
+    tmp_path: Path, pitch: float, lost: float
+) -> None:
+    scan = rays()
+    cosine, sine = np.cos(np.radians(pitch)), np.sin(np.radians(pitch))
+    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    there = np.random.default_rng(0).random(len(scan)) >= lost
+    points = np.where(there[:, None], scan.points @ turn.T, np.nan)
+    tilted = replace(scan, points=points.astype(np.float32))
+    ring = (200 - scan.ring).astype(np.uint8)
+    write_log(tmp_path / "a.pcd", {**axes(tilted), "i": scan.reflectance, "ring": ring})
+    read = open_scans(tmp_path, sensor=scan.sensor, on_bad="drop-points")[0]
+    assert np.array_equal(read.ring, scan.ring[there])
+
+
+def test_more_rings_than_the_sensor_has_rows_stay_apart() -> None:
+    scan = replace(rays(), sensor=load_sensor("vlp16"))
+    assert np.array_equal(rows_of_rings(scan), scan.ring)
+
+
+def test_rings_become_rows_of_the_sensor_that_the_folder_names(tmp_path: Path) -> None:
+    scan = town_of("velodyne")[0]
+    write_log(tmp_path / "a.pcd", LOGS["velodyne"].columns(scan))
+    said = {"format": "lidar-synth-scans/1", "sensor": "vlp16"}
+    (tmp_path / "scans.json").write_text(json.dumps(said))
+    assert np.array_equal(open_scans(tmp_path)[0].ring, scan.ring)
+
+
+def test_labels_of_other_programs_are_not_taken_for_classes(tmp_path: Path) -> None:
+    scan = rays(8)
+    ones = np.ones(len(scan))
+    foreign = {
+        "label": ones.astype(np.uint8),
+        "confidence": ones.astype(np.float32),
+        "cause": ones.astype(np.uint8),
+    }
+    write_log(tmp_path / "a.pcd", {**axes(scan), "i": scan.reflectance, **foreign})
+    read = open_scans(tmp_path, sensor=scan.sensor)[0]
+    assert list(read.fields()) == ["reflectance"]
+
+
+def test_points_without_reflectance_are_reported(tmp_path: Path) -> None:
+    scan = rays(8)
+    write_log(tmp_path / "a.pcd", axes(scan))
+    with pytest.warns(UserWarning, match="have no reflectance .*: it is read as 0"):
+        read = open_scans(tmp_path, sensor=scan.sensor)[0]
+    assert not read.reflectance.any()
+
+
+def test_arrays_of_other_programs_are_read_as_the_folder_says(tmp_path: Path) -> None:
+    scan = rays(8)
+    arrays = {"points": scan.points, "reflectance": scan.reflectance * 255}
+    said = {"format": "lidar-synth-scans/1", "sensor": scan.sensor.to_dict()}
+    for name, values in (("points", arrays), ("range", {"range": np.ones((128, 8))})):
+        (tmp_path / name).mkdir()
+        np.savez(tmp_path / name / "a.npz", **values)
+        (tmp_path / name / "scans.json").write_text(json.dumps(said))
+    read = open_scans(tmp_path / "points", reflectance_max=255)[0]
+    assert read.sensor == scan.sensor and np.array_equal(read.points, scan.points)
+    assert np.allclose(read.reflectance, scan.reflectance)
+    assert open_scans(tmp_path / "range")[0].sensor == scan.sensor
 
 
 def test_channels_and_files_without_a_sensor_are_read(tmp_path: Path) -> None:

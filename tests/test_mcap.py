@@ -41,7 +41,12 @@ def test_the_record_of_a_driver_is_read(
         assert scan.id == f"drive/{number:06d}"
 
 
-@pytest.mark.parametrize("changes", [{"is_dense": False}, {"order": ">"}])
+NO_COUNT = [field | {"count": 0} for field in cloud(0)["fields"]]
+
+
+@pytest.mark.parametrize(
+    "changes", [{"is_dense": False}, {"order": ">"}, {"fields": NO_COUNT}]
+)
 def test_other_clouds_are_read(tmp_path: Path, changes: dict[str, Any]) -> None:
     path = record(tmp_path / "a.mcap", [("/points", 0, cloud(1, **changes))])
     record(tmp_path / "b.mcap", [("/points", 0, cloud(1))])
@@ -50,6 +55,32 @@ def test_other_clouds_are_read(tmp_path: Path, changes: dict[str, Any]) -> None:
     assert scans.ids == ("a", "b") and MCAP(path).ids == ("a",)
     assert np.array_equal(scans[0].points, scans[1].points)
     assert np.array_equal(scans[0].reflectance, scans[1].reflectance)
+
+
+def test_a_cloud_without_rings_is_read_as_its_error_says(tmp_path: Path) -> None:
+    fields = [field for field in cloud(0)["fields"] if field["name"] != "ring"]
+    record(tmp_path / "a.mcap", [("/points", 0, cloud(0, fields=fields))])
+    with pytest.raises(DataError, match="reflectance_max=255"):
+        open_scans(tmp_path, sensor="os1_128")[0]
+    scans = open_scans(tmp_path, sensor="os1_128", reflectance_max=255)
+    scans.skip_sensor_check()
+    assert 0.9 < scans[0].reflectance.max() <= 1
+    with pytest.raises(ConfigError, match="no fields: layout 'mcap' has none$"):
+        open_scans(tmp_path, fields=5)
+    with pytest.raises(ConfigError, match="reflectance_max=0; expected above 0"):
+        open_scans(tmp_path, reflectance_max=0)
+
+
+@pytest.mark.filterwarnings("ignore:scan a of")  # points in a box are of no sensor
+def test_rings_become_rows_of_the_sensor_that_the_folder_names(tmp_path: Path) -> None:
+    record(tmp_path / "a.mcap", [("/points", 0, cloud(0))])
+    given = open_scans(tmp_path, sensor="os1_128")[0]
+    said = '{"format": "lidar-synth-scans/1", "sensor": "os1_128"}'
+    (tmp_path / "scans.json").write_text(said)
+    assert np.array_equal(open_scans(tmp_path)[0].ring, given.ring)
+    unknown = open_scans(tmp_path)
+    unknown.skip_sensor_check()
+    assert not np.array_equal(unknown[0].ring, given.ring)
 
 
 def test_rows_may_have_bytes_at_their_ends(tmp_path: Path) -> None:

@@ -109,6 +109,7 @@ def test_a_loader_resumes_after_the_latest_batch(
     resumed.load_state_dict(state)
     whole = in_order(2)
     assert seen == whole[: len(seen)]
+    assert len(resumed) == len(whole) // 2  # whole epochs, which trainers count
     assert ids(resumed) == (whole[len(seen) :] or in_order(3))
     assert resumed.epoch == (3 if done else 4)
     assert ids(resumed) == in_order(resumed.epoch - 1)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 from mixed import Theirs, loader, mixed
-from mixtures import Endless, Scans
+from mixtures import Endless, Scans, as_is
 from test_generator import SENSOR as GENERATED_SENSOR
 from test_generator import write
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, IterableDataset, Subset
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
@@ -96,6 +96,15 @@ def test_sources_that_differ_have_different_plans() -> None:
     assert len({identity_of(source) for source in (*towns, *seen)}) == 8
     assert identity_of(Town(0, scans=50)) == identity_of(towns[0])
     assert identity_of(SeenAs(Town(0, scans=50), transfers[0])) == identity_of(seen[0])
+    parts: list[Any] = [
+        Subset(town, indices)  # type: ignore[arg-type]
+        for town in towns[:2]
+        for indices in ([0, 1], [0, 2])
+    ]
+    assert len({identity_of(part) for part in parts}) == 4
+    assert identity_of(Subset(parts[0], [1])) != identity_of(Subset(parts[1], [1]))
+    same: Any = Subset(Town(0, scans=50), range(2))  # type: ignore[arg-type]
+    assert identity_of(same) == identity_of(parts[0])
     scans = Scans("a", 3, load_sensor("hdl64e_kitti"))
     scans.ids = ("a", "b", "c")  # type: ignore[attr-defined]
     before = identity_of(SeenAs(scans, transfers[0]))
@@ -235,10 +244,22 @@ def other_classes() -> Scans:
     return scans
 
 
-def wrong_labels() -> Any:
+def wrong_labels(label: int) -> Any:
     scans = Scans("r", 1)
-    scans[0].label[:] = 40
+    scans[0].label = np.full(len(scans[0]), label)
     return MixedScans(scans, ratio=0)[0]
+
+
+class OneByOne(IterableDataset[Any]):
+    """A trainer's samples without numbers."""
+
+    def __iter__(self) -> Any:
+        return iter(range(5))
+
+
+def batch_of(sample: Any) -> Any:
+    train = MixedScans(Scans("r", 2), ratio=0, to_sample=lambda scan, rng: sample)
+    return next(iter(train.loader(2)))
 
 
 @pytest.mark.parametrize(
@@ -313,7 +334,38 @@ def wrong_labels() -> Any:
             ConfigError,
             r"1 sources with weights \[1, 2\]",
         ),
-        (wrong_labels, DataError, r"labels \[40\]; expected train ids 0..18, or 255"),
+        (
+            lambda: wrong_labels(40),
+            DataError,
+            r"labels \[40\]; expected train ids 0..18, or 255",
+        ),
+        (lambda: wrong_labels(-1), DataError, r"labels \[-1\]; expected train ids"),
+        (
+            lambda: MixedScans(None, Endless(), {0: 1.0, 3: 0.5}, epoch_size=4),
+            DataError,
+            r"no real scans, with ratio 0.5 in epoch 3 and epoch_size=4",
+        ),
+        (
+            lambda: MixedScans(Scans("r", 4), None, {0: 0.0, 10: 0.5}),
+            ConfigError,
+            r"ratio 0.5 in epoch 10 without a synthetic source",
+        ),
+        (
+            lambda: MixedScans.wrap(OneByOne(), Endless(), to_sample=as_is),
+            ConfigError,
+            r"real=OneByOne.*map-style dataset",
+        ),
+        (
+            lambda: MixedScans(iter(Scans("r", 4)), Endless()),
+            ConfigError,
+            r"real=list_iterator.*map-style dataset",
+        ),
+        (
+            lambda: batch_of({"points": 1}),
+            ConfigError,
+            r"a sample of the form \['points'\]; expected a dict with boxes,.*collate=",
+        ),
+        (lambda: batch_of((1, 2)), ConfigError, r"of the form tuple;.*collate="),
     ],
 )
 def test_invalid_mixtures_are_refused(

@@ -3,14 +3,16 @@
 import logging
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from mixtures import SENSOR, Endless, Scans, as_is
-from streets import street
+from streets import kitti, street
 from torch.utils.data import DataLoader
 
 from lidar_synth import mix
+from lidar_synth.formats import KITTIObject
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
 
@@ -56,6 +58,14 @@ def test_a_like_density_or_range_images_are_not_reported(
     assert not logged(train, caplog)
 
 
+def test_reflectances_of_another_scale_are_reported_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    real = [replace(scan, reflectance=scan.reflectance * 255) for scan in Scans("r", 6)]
+    [message] = logged(MixedScans(real, Endless(), 0.5, collate="range"), caplog)
+    assert "has reflectances up to 2" in message and "255 by 255" in message
+
+
 def test_a_tiny_bank_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     MixedScans(Scans("r", 28), Scans("s", 6), 0.9)
     assert (
@@ -99,6 +109,16 @@ def test_unlabelled_real_scans_of_a_detector_are_not(
     real = [replace(street(i), label=None, instance=None) for i in range(4)]
     train = mix(real, [street(9), street(8)], 0.5, task="detection", epochs=8)
     assert not logged(train, caplog)
+
+
+def test_points_outside_of_the_view_that_has_boxes_are(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    real = KITTIObject(kitti(tmp_path / "k", 2))
+    mix(real.with_boxes(), [street(9)], task="detection", epochs=8)
+    assert "with_boxes()" not in caplog.text
+    mix(real, [street(9)], task="detection", epochs=8)
+    assert "Take open_scans" in caplog.text and "with_boxes()" in caplog.text
 
 
 def test_a_sampler_made_anew_for_each_epoch_does_not_hide_a_repetition() -> None:

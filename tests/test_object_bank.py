@@ -200,6 +200,11 @@ def test_town_objects_in_a_town_scan(town: Town, bank: ObjectBank, bare: bool) -
     for box in new.values:
         ground = ground_under(host, box)
         assert ground is not None and abs(box[2] - box[5] / 2 - ground.height) < 0.35
+    if bare:  # the objects' labels do not tell where the ground is
+        unlabelled = replace(pasted, label=None)
+        assert [ground_under(pasted, box) for box in pasted.boxes.values] == [
+            ground_under(unlabelled, box) for box in pasted.boxes.values
+        ]
 
 
 @pytest.mark.slow

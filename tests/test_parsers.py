@@ -62,7 +62,6 @@ OUTSIDE = {
     "lab/evaluate/protocols/__init__.py": {"yaml.safe_load"},
     "lab/evaluate/segmentation.py": {"json.loads"},
     "lab/town/catalogue.py": {"yaml.load"},
-    "bake/remote.py": {"json.loads"},
     "lab/train/arrays.py": {"json.loads"},
     "lab/train/selection.py": {"json.loads"},
 }

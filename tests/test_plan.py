@@ -9,6 +9,7 @@ from math import ceil
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+import torch
 from hypothesis import assume, given, settings
 
 from lidar_synth.errors import ConfigError, DataError
@@ -373,6 +374,8 @@ SCHEDULES: list[tuple[object, list[float]]] = [
     ([0.1, 0.2, 0.3, 0.4, 0.5], [0.1, 0.2, 0.3, 0.4, 0.5]),
     ({0: 0.5, 3: 0.25}, [0.5, 0.5, 0.5, 0.25, 0.25]),
     (Linear(0.0, 0.5, 3), [0.0, 0.25, 0.5, 0.5, 0.5]),
+    (np.linspace(0.5, 0.1, 5), [0.5, 0.4, 0.3, 0.2, 0.1]),
+    (torch.linspace(0.5, 0.1, 5), [0.5, 0.4, 0.3, 0.2, 0.1]),
     (lambda epoch: 1 / (epoch + 2), [1 / 2, 1 / 3, 1 / 4, 1 / 5, 1 / 6]),
 ]
 

@@ -100,6 +100,21 @@ def test_auto_takes_drives_and_else_poses() -> None:
     assert find_places(SOURCES["pose"]) == find_places(SOURCES["pose"], "pose")
 
 
+def test_places_of_shuffled_frames_are_their_drives(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    source = drives(2, 2)
+    source.drives = ("b", "a", "a", "b")
+    assert find_places(source) == {"a": [1, 2], "b": [0, 3]}
+    source.drives = None
+    source.ids = [f"training/{i}" for i in range(4)]
+    with pytest.raises(DataError, match=r"mapping/ of the devkit"):
+        find_places(source)
+    assert not caplog.messages
+    assert len(find_places(source, "stretch:2")) == 2
+    assert "a comparison is too good" in caplog.text
+
+
 @pytest.mark.parametrize("count", [1, 2, 5, None])
 def test_labelled_scans_come_from_many_places_and_not_from_the_one_left_out(
     count: int | None,

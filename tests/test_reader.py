@@ -419,6 +419,7 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
         ({"labels": "paste"}, "labels='paste'.*generated, condition, boxes, none"),
         ({"labels": {"generated": {"kind": 1}}}, "argument 'kind'; expected arguments"),
         ({"as_sensor": "vlp16"}, "as_sensor: vlp16 for a plan file; expected none"),
+        ({"augment": ["fog"]}, r"augment: \['fog'\] for a plan file; expected none"),
         ({"labels": "pseudo"}, "labels='pseudo'"),
         (
             {"synthetic": "town"},

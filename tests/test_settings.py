@@ -41,7 +41,7 @@ WRONG: dict[str, tuple[str, str]] = {
     ),
     "a typing error": ("seed: [0", "is not YAML"),
     "a tag": ("seed: !!python/name:os.system", "it has the tag"),
-    "settings as a list": ("[1, 2]", "expected a dict of synthetic, ratio"),
+    "settings as a list": ("[1, 2]", "expected a dict of synthetic, epochs, ratio"),
 }
 
 

@@ -5,11 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from accelerate import Accelerator
 from test_run import call, distilling, one_thread, scans, teacher, write_config
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import load_checkpoint, read_header
+from lidar_synth.generate.flow.path import METRICS
+from lidar_synth.generate.flow.timesteps import select_timesteps
 from lidar_synth.generate.loading import load_generator
+from lidar_synth.lab.train import DistillConfig, load_config
+from lidar_synth.lab.train.loop import weigh_metric
+from lidar_synth.lab.train.runs import open_stage
+from lidar_synth.lab.train.student import StudentStage
 
 __all__ = ["one_thread", "scans", "teacher"]  # fixtures
 
@@ -54,7 +61,8 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(
         call("distill", config, f"teacher={made}", f"output={tmp_path / 'other'}")
     with pytest.raises(
         ConfigError,
-        match=r"also=\[2\] for a hdit by reflow; expected an hdit, adaptive_piecewise",
+        match=r"also=\[2\] for a hdit by reflow; expected an hdit, adaptive_piecewise. "
+        r"Give also=\[\]",
     ):
         call(
             "distill",
@@ -89,6 +97,33 @@ def test_a_student_is_not_distilled_on_the_town_in_place_of_the_teachers_scans(
     ):
         call("distill", "town_pixel_student", *given)
     assert not (tmp_path / "run" / "cache").exists()
+
+
+def test_timesteps_are_selected_by_the_metric_of_the_training(
+    scans: Path, teacher: Path, tmp_path: Path
+) -> None:
+    recipe = {"weights": {"label": 0.01}, "iterations": 1, "metric": "pseudo_huber"}
+    selection = {"candidates": 6, "trajectories": 2}
+    config = load_config(
+        DistillConfig,
+        write_config(
+            scans, tmp_path, teacher=str(teacher), selection=selection, recipe=recipe
+        ),
+    )
+    stage = open_stage(config)
+    assert isinstance(stage, StudentStage)
+    data = stage.open_data()
+    stage.prepare(data, Accelerator(cpu=True))
+    plain = METRICS["pseudo_huber"]
+    by_each, by_none = (
+        select_timesteps(stage.flow, stage.codec.shape, 4, 6, 2, metric, progress=False)
+        for metric in (weigh_metric(plain, recipe["weights"], data.tensors), plain)
+    )
+    cost = stage.header.provenance["selection"]["cost"]
+    assert cost == pytest.approx(by_each.cost) != pytest.approx(by_none.cost)
+    unweighted = config.recipe.__class__(**vars(config.recipe) | {"weights": {}})
+    with pytest.raises(ConfigError, match=r"made with weights.label=0.01"):
+        open_stage(config.model_copy(update={"recipe": unweighted}))
 
 
 def test_a_damaged_selection_is_made_again(

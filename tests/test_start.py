@@ -10,10 +10,23 @@ from accelerate.state import AcceleratorState
 
 from lidar_synth.datasets.recordings import seen_by
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.checkpoint import load_checkpoint, save_checkpoint
+from lidar_synth.generate.checkpoint import (
+    load_checkpoint,
+    network_hash,
+    save_checkpoint,
+)
 from lidar_synth.generate.loading import find_model
+from lidar_synth.lab.cli.train import distill
 from lidar_synth.lab.evaluate.leakage import overlap, town
-from lidar_synth.lab.train import TrainConfig, load_config, precision, run
+from lidar_synth.lab.train import (
+    DistillConfig,
+    TrainConfig,
+    load_config,
+    precision,
+    run,
+)
+from lidar_synth.lab.train.runs import open_stage
+from lidar_synth.lab.train.stage import Stage
 from lidar_synth.lab.train.start import open_networks
 
 
@@ -56,6 +69,49 @@ def test_a_flow_is_trained_further_on_another_autoencoder_of_the_same_latents(
     save_checkpoint(path, replace(town.header, networks=kept, sensor=other), networks)
     with pytest.raises(ConfigError, match="of another sensor than init"):
         open_networks(load_config(TrainConfig, "town_teacher", given))
+
+
+TEACHER = Path(__file__).parent.parent / "tools" / "stages" / "town_teacher.safetensors"
+
+
+def student(folder: Path, teacher: Path, *given: str) -> Stage:
+    """The distillation of a town's student before its first step."""
+    needed = [f"teacher={teacher}", f"output={folder / 'run'}"]
+    return open_stage(load_config(DistillConfig, "town_student", [*given, *needed]))
+
+
+def test_the_examples_of_distill_can_be_run(tmp_path: Path) -> None:
+    lines = [line.split() for line in (distill.__doc__ or "").splitlines()]
+    calls = [line[3:] for line in lines if line[1:3] == ["distill", "town_student"]]
+    assert len(calls) == 3
+    for given in calls:
+        assert len(student(tmp_path, TEACHER, *given).header.time_grid) == 5
+
+
+def test_weights_that_the_teacher_lacks_follow_the_seed(tmp_path: Path) -> None:
+    zero, again, one = (
+        network_hash(student(tmp_path, TEACHER, f"seed={seed}").network)
+        for seed in (0, 0, 1)
+    )
+    assert zero == again != one
+
+
+def test_a_student_goes_on_with_the_latents_of_its_teacher_alone(
+    tmp_path: Path,
+) -> None:
+    student(tmp_path, TEACHER, "init=town")  # its weights were rounded when stored
+    teacher = load_checkpoint(TEACHER)
+    codec = teacher.networks["codec"]
+    path = tmp_path / "teacher.safetensors"
+    for weight, fits in (("head.weight", True), ("to_latent.bias", False)):
+        with torch.no_grad():
+            codec.get_parameter(weight).add_(0.1)
+        save_checkpoint(path, teacher.header, teacher.networks)
+        if fits:
+            student(tmp_path, path, "init=town")
+            continue
+        with pytest.raises(ConfigError, match="init town with another autoencoder"):
+            student(tmp_path, path, "init=town")
 
 
 def config(folder: Path, chosen: str) -> TrainConfig:

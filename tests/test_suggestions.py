@@ -112,7 +112,7 @@ YAML = {
     "{synthetic: twon}": "Did you mean 'town'",
     "{ratio: 0.5}": "synthetic: a bank's folder",
     "{synthetic: BANK": "is not YAML",
-    "[synthetic, ratio]": "a dict of synthetic, ratio",
+    "[synthetic, ratio]": "a dict of synthetic, epochs, ratio",
     "{synthetic: BANK, loss_weight: 0.1}": "Use a smaller ratio",
 }
 """By file of a mixture: what the error says."""

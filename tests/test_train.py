@@ -1,6 +1,7 @@
 """Training: data that follow from their position, schedules, the state through a kill, the loop."""
 
 import math
+import os
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,8 +17,11 @@ from accelerate import Accelerator
 from conftest import random_scan
 from hypothesis import given
 from torch import Tensor, nn
+from torch.utils.data import ConcatDataset
 
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.parsing import read_sealed, seal
+from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.flow.distill import STRATEGIES
 from lidar_synth.generate.flow.path import METRICS, Example
 from lidar_synth.generate.flow.solvers import uniform_grid
@@ -41,6 +45,7 @@ from lidar_synth.lab.train import (
     student_task,
     teacher_task,
 )
+from lidar_synth.lab.train.arrays import NOTE
 from lidar_synth.lab.train.data import InTurns
 from lidar_synth.lab.train.loop import Record, read_figures
 
@@ -147,6 +152,36 @@ def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(
         cache_scans(
             scans, SENSOR, ["range", "label"], tmp_path, {"town": 150}, progress=False
         )
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_cache_of_scans_that_have_changed_is_refused(
+    tmp_path: Path, several: bool
+) -> None:
+    root = tmp_path / "scans"
+    writer = WRITERS["semantic_kitti"](root)
+    for i, scan in enumerate(SCANS):
+        writer.write(scan, i)
+    output = root / "runs"  # a run that lies among its scans does not change them
+
+    def cache() -> None:
+        opened: Any = open_scans(root)
+        source = ConcatDataset([SCANS, opened]) if several else opened
+        cache_scans(source, SENSOR, ["range"], output / "cache", progress=False)
+        (output / "state.safetensors").write_bytes(bytes(len(list(output.iterdir()))))
+
+    cache()
+    cache()
+    note = output / "cache" / NOTE
+    facts = read_sealed(note, "a note")
+    whole = note.read_bytes()
+    note.write_bytes(seal({k: v for k, v in facts.items() if k != "files"}))
+    cache()  # of an earlier version
+    note.write_bytes(whole)
+    corrected = next(root.rglob("*.label"))
+    os.utime(corrected, (0, corrected.stat().st_mtime + 60))  # as large as before
+    with pytest.raises(ConfigError, match=r"cache of other data \(files differ\)"):
+        cache()
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ import lidar_synth.bake.repair as repair_module
 from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.bake.edit import head, merge, split
 from lidar_synth.bake.folder import write_bank_files
+from lidar_synth.bake.making import NOTE
 from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import AGREE, regenerate, verify
@@ -28,6 +29,7 @@ from lidar_synth.bank import INDEX, Bank, Index
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import sha256
+from lidar_synth.files.lock import lock_shared
 from lidar_synth.geometry.scan import RangeImage
 
 
@@ -197,6 +199,22 @@ def test_repair_removes_what_a_killed_repair_left(root: Path, model: Path) -> No
         part.name: "removed: a killed repair left it"
     }
     assert not part.exists() and repair(root, str(model), progress=False) == {}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="files are not locked on Windows")
+@pytest.mark.parametrize("claim", [SETTINGS, NOTE])
+def test_repair_leaves_a_folder_that_another_process_fills(
+    root: Path, claim: str
+) -> None:
+    part = root / ".shard-00000.h5.1.part"
+    part.write_bytes(b"half a shard")
+    (root / claim).touch()
+    with (
+        lock_shared(root / claim),
+        pytest.raises(ConfigError, match="bank, in which another process works"),
+    ):
+        repair(root, progress=False)
+    assert part.exists()
 
 
 def test_verify_and_repair_report_damage_of_other_files(
@@ -444,6 +462,17 @@ def test_split_and_merge_are_inverse(root: Path, tmp_path: Path) -> None:
     assert index.scans == 8 and len(index.sources) == 1
     assert names_and_points(tmp_path / "merged") == names_and_points(root)
     assert verify(tmp_path / "merged", progress=False) == []
+
+
+def test_banks_of_links_are_merged_as_their_files(root: Path, tmp_path: Path) -> None:
+    """The cache of the hub keeps files as relative links."""
+    linked = tmp_path / "snapshots" / "bank"
+    linked.mkdir(parents=True)
+    for path in root.iterdir():
+        (linked / path.name).symlink_to(Path("../..", "bank", path.name))
+    merge([Bank(linked)], tmp_path / "merged", progress=False)
+    assert verify(tmp_path / "merged", progress=False) == []
+    assert names_and_points(tmp_path / "merged") == names_and_points(root)
 
 
 def test_head_takes_the_first_scans(root: Path, tmp_path: Path, model: Path) -> None:

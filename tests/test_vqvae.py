@@ -166,6 +166,8 @@ def test_without_a_codebook_latents_are_bounded() -> None:
     output, gap, code_gap = net(image())
     assert torch.equal(output, net.decode(net.encode(image())))
     assert not gap.any() and not code_gap.any()
+    # DistributedDataParallel refuses one that is trained and not used
+    assert not net.codebook.codes.requires_grad
 
 
 @torch.no_grad()

@@ -19,6 +19,7 @@ from lidar_synth.weather import (
     Dirt,
     Fog,
     IncompleteEcho,
+    LowPower,
     MissingBeams,
     MotionBlur,
     Rain,
@@ -41,6 +42,15 @@ from lidar_synth.weather.wet_ground import find_ground, reflect_from_water
 
 WORSE = ("fog", "rain", "snow", "spray", "dirt", "wet_ground", "low_power")
 """Corruptions with which less returns the worse they are."""
+LEAST = {
+    "fog": 1e5,
+    "rain": 0.1,
+    "snow": 0.1,
+    "spray": 1e-3,
+    "cross_sensor": 1.0,
+    "low_power": 0.999,
+}
+"""Parameters of the lightest of each; of the others they are shares or lengths, 0.001."""
 MOVED = {"motion_blur", "crosstalk"}
 """Corruptions that move points off their rays."""
 PARTICLES = {
@@ -127,6 +137,25 @@ def test_fewer_surfaces_return_the_worse_it_is_and_none_farther(
         before = np.linalg.norm(clear.points[change.source], axis=1)
         assert (np.linalg.norm(change.points, axis=1) <= before + 1e-3).all()
     assert 1 > shares[0] > shares[1] > shares[2] > 0
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_far_returns_stay_the_more_the_lighter_it_is(name: str, clear: Scan) -> None:
+    """Towards none all of them, also those that are too dark for the data sheet."""
+    scan = replace(clear, reflectance=np.zeros_like(clear.reflectance))
+    far = np.linalg.norm(scan.points, axis=1) > 50
+    assert far.sum() > 1000
+    kind = CORRUPTIONS[name]
+    severe = [next(iter(options.values())) for options in kind.SEVERE]
+    lighter = np.geomspace(severe[0], LEAST.get(name, 1e-3), 4)[1:]
+    shares = []
+    for value in [*reversed(severe), *lighter]:
+        change = kind(value).change(scan, keyed_rng(2))
+        kept = change.source[change.cause == SURFACE]
+        shares.append(far[kept].sum() / far.sum())
+    assert shares == sorted(shares) or name not in WORSE
+    # The least snow, 0.1 mm / h, takes a sixth of the signal over 50 m.
+    assert shares[-1] > (0.6 if name == "snow" else 0.98)
 
 
 @pytest.mark.parametrize("visibility", [60.0, 400.0])
@@ -281,6 +310,8 @@ def test_wet_ground_is_lost_far_away_first(clear: Scan) -> None:
     assert left[ground & far].mean() < left[ground & ~far].mean() - 0.1
     bare = find_ground(replace(clear, label=None))
     assert (bare == ground).mean() > 0.8
+    ignored = np.full_like(clear.label, IGNORE)
+    assert np.array_equal(find_ground(replace(clear, label=ignored)), bare)
 
 
 def test_beams_go_whole(clear: Scan) -> None:
@@ -335,11 +366,15 @@ def test_mixed_scans_take_them(clear: Scan) -> None:
 
 
 def test_weak_returns_are_the_first_to_go() -> None:
-    scans = [target(np.linspace(2, 70, 3000), p) for p in (0.1, 0.9)]
-    farthest = [Rain(60)(s, keyed_rng(0)).points[:, 0].max() for s in scans]
-    assert farthest[0] < 45 < farthest[1]
-    loss = np.exp(-2 * Rain(60).extinction * farthest[0])
-    assert 0.1 / farthest[0] ** 2 * loss == pytest.approx(FLOOR, rel=0.05)
+    """A signal below the sensor's floor is above it by an unknown, drawn amount."""
+    for reflectance in (0.1, 0.9):
+        scan = target(np.linspace(2, 70, 3000), reflectance)
+        farthest = LowPower(0.05)(scan, keyed_rng(0)).points[:, 0].max()
+        assert 0.05 * reflectance / farthest**2 == pytest.approx(FLOOR, rel=0.05)
+    beyond = target(np.full(10000, 60), 0.1)
+    for power in (0.99, 0.8, 0.5):
+        share = len(LowPower(power)(beyond, keyed_rng(0))) / len(beyond)
+        assert share == pytest.approx(np.exp(1 - 1 / power), abs=0.015)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from roundtrips import back
 
 from lidar_synth.errors import DataError, LidarSynthError
 from lidar_synth.formats import WRITERS
-from lidar_synth.formats.kitti360_boxes import write_boxes
+from lidar_synth.formats.kitti360_boxes import read_boxes, write_boxes
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import CAUSES, Boxes, Scan
 
@@ -244,6 +244,21 @@ def test_an_odd_timestamp_in_existing_boxes_is_named(tmp_path: Path) -> None:
     path.write_text("<a><object0><timestamp>soon</timestamp></object0></a>")
     with pytest.raises(DataError, match="soon.*data_3d_bboxes"):
         write_boxes(path, {0: (some_boxes(), np.eye(4))})
+
+
+@pytest.mark.parametrize("known", [(), (1, 2), (26_001, 26_004), (5_001, 999)])
+def test_a_kitti360_box_of_unknown_instance_gets_a_free_one(
+    tmp_path: Path, known: tuple[int, ...]
+) -> None:
+    instance = np.int32((-1, -1, -1, -1, *known))
+    names = ("Car", "Tram", "Car", "Car", "Car", "Tram")[: len(instance)]
+    values = np.tile(np.float32([10, 2, -1, 4, 2, 1.6, 0]), (len(instance), 1))
+    path = tmp_path / "drive.xml"
+    write_boxes(path, {0: (Boxes(values, names, instance=instance), np.eye(4))})
+    read = read_boxes(path).instances.tolist()
+    assert len(set(read)) == len(instance)
+    assert all(each // 1000 in (26, 31) for each in read[:4])
+    assert [each % 1000 for each in read[4:]] == [each % 1000 for each in known]
 
 
 def test_boxes_are_no_larger_than_a_lidar_sees() -> None:

@@ -252,7 +252,7 @@ def _link(bank: Bank, entry: Entry, path: Path) -> None:
 
 def _link_file(source: Path, path: Path) -> None:
     try:
-        os.link(source, path)
+        os.link(source.resolve(), path)  # the hub's cache holds relative symlinks
     except OSError:
         try:
             shutil.copyfile(source, path)
@@ -288,17 +288,27 @@ def _making(out: Path, what: str, banks: Sequence[Bank], *more: Any) -> Iterator
 
 def _check_disjoint(banks: Sequence[Bank]) -> None:
     """Refuse banks that share a scan: the same model, seed and index, by which scans are named."""
-    taken: dict[tuple[str, int], list[tuple[int, int, str | Path]]] = {}
+    taken: dict[tuple[str, int], list[tuple[Entry, str | Path]]] = {}
     for bank in banks:
         for entry in bank.index.shards:
             facts = bank.index.sources[entry.source]
             others = taken.setdefault((facts.model, entry.seed), [])
-            for first, stop, root in others:
-                if entry.first < stop and first < entry.first + entry.scans:
+            for other, root in others:
+                overlap = other.first < _end(entry) and entry.first < _end(other)
+                if overlap and (both := _kept(other) & _kept(entry)):
                     raise ConfigError(
-                        f"{root} and {bank.root} both hold scan {max(first, entry.first)} of "
-                        f"seed {entry.seed}",
+                        f"{root} and {bank.root} both hold scan {min(both)} of seed "
+                        f"{entry.seed}",
                         "every scan only once",
                         "Bake with another --seed, or a --first after the end of the other bank.",
                     )
-            others.append((entry.first, entry.first + entry.scans, bank.root))
+            others.append((entry, bank.root))
+
+
+def _end(entry: Entry) -> int:
+    return entry.first + entry.scans
+
+
+def _kept(entry: Entry) -> set[int]:
+    """The indices of the scans of a shard that are in the bank."""
+    return {entry.first + entry.position(rank) for rank in range(entry.kept)}

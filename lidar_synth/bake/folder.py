@@ -25,8 +25,8 @@ from lidar_synth.bank import INDEX, Entry, Index
 from lidar_synth.bank.card import card_files
 from lidar_synth.bank.folder import BankFolder, open_folder
 from lidar_synth.bank.reader import read_index
-from lidar_synth.errors import DataError, FileError
-from lidar_synth.files.claims import claim
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.claims import compare
 from lidar_synth.files.disk import read_file, sha256, sync_folder, write_file
 from lidar_synth.files.lock import lock_shared, try_lock
 from lidar_synth.formats.writer import NOTES
@@ -35,21 +35,77 @@ LOGS = ".slurm"
 """Folder with the logs of Slurm's jobs, in the bank's folder until the bank is finished."""
 
 
-def prepare(plan: BakePlan) -> None:
+def prepare(plan: BakePlan) -> BakePlan:
     """Claim the folder for the plan's settings, and remove temporary files of killed runs.
 
+    Returns:
+        The plan as ``check_settings`` gives it.
+
     Raises:
-        ConfigError: if it holds a bank with other settings, and the message shows the difference;
-            or files that the bake would replace.
+        ConfigError: as ``check_settings``.
         FileError: if it cannot be written.
     """
-    if isinstance(plan.out, str):
-        remote.prepare(plan, plan.out)
-        return
-    if not (plan.out / SETTINGS).exists():
+    if not _is_claimed(plan.out):
         refuse_others(plan.out)
-    claim(plan.out / SETTINGS, plan.settings)
-    _clear_up(plan.out, finished=False)
+        content = json.dumps(plan.settings, indent=1).encode()
+        # Another process may write it at the same time.
+        open_folder(plan.out).write(SETTINGS, content, overwrite=False)
+    plan = check_settings(plan)
+    if isinstance(plan.out, Path):
+        _clear_up(plan.out, finished=False)
+    return plan
+
+
+def check_settings(plan: BakePlan) -> BakePlan:
+    """Check, without writing, that the plan may fill its folder.
+
+    Returns:
+        The plan. If its conditions are those of the folder's bank, but have moved, it states the
+        old place, which stands in every shard: the bytes stay the same.
+
+    Raises:
+        ConfigError: if the folder holds a bank with other settings, and the message shows the
+            difference; or files that the bake would replace.
+        DataError, FileError: if its settings are damaged or cannot be read.
+    """
+    if not _is_claimed(plan.out):
+        refuse_others(plan.out)
+        return plan
+    text = open_folder(plan.out).read(SETTINGS).decode(errors="replace")
+    with suppress(ValueError, LookupError, TypeError, RecursionError):
+        recorded = json.loads(text)
+        if plan.settings["condition_content"] == recorded["condition_content"]:
+            plan = _with_conditions_at(plan, recorded["condition"])
+    compare(text, json.loads(json.dumps(plan.settings)), plan.out, SETTINGS)
+    return plan
+
+
+def _is_claimed(root: str | Path) -> bool:
+    if isinstance(root, str):
+        return SETTINGS in open_folder(root).sizes()
+    return (root / SETTINGS).is_file()
+
+
+def _with_conditions_at(plan: BakePlan, path: str) -> BakePlan:
+    """The plan of a bank that states another path of its conditions."""
+    facts = replace(
+        plan.facts,
+        settings=plan.facts.settings | {"condition": path},
+        condition={**(plan.facts.condition or {}), "source": path},
+    )
+    return replace(plan, facts=facts)
+
+
+def release(plan: BakePlan) -> None:
+    """Take back the claim of a folder that holds no shard and in which no other process is at
+    work, so that the corrected call may use it."""
+    if isinstance(plan.out, str):
+        return
+    # a ConfigError: there is a shard
+    with try_lock(plan.out / SETTINGS) as alone, suppress(ConfigError, OSError):
+        if alone:
+            refuse_others(plan.out)
+            (plan.out / SETTINGS).unlink()
 
 
 @contextmanager

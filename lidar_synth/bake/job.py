@@ -22,7 +22,7 @@ from lidar_synth.bake.conditions import conditions_for, fingerprint, settle_obje
 from lidar_synth.bake.options import BakeJob, default_shard_size
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
-from lidar_synth.bank.storage import bank_root
+from lidar_synth.bank.storage import bank_root, is_url
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.flow.solvers import SOLVERS
 from lidar_synth.generate.generator import BATCH
@@ -40,7 +40,7 @@ class BakePlan:
     Args:
         out: the bank's folder, or its URL.
         job: the settings, with ``batch``, ``fields`` and ``shard_size`` resolved and the path of a
-            checkpoint file made absolute.
+            checkpoint file and of a local dataset of conditions made absolute.
         facts: the facts of the bank.
     """
 
@@ -110,8 +110,9 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
             f"scans up to index {job.first + job.count}", "less than 2^63"
         )
     generator = load_generator(job.model, columns=job.columns)
+    condition = _settle_path(job.condition)
     source = conditions_for(
-        generator, job.condition, job.condition_layout, job.condition_split
+        generator, condition, job.condition_layout, job.condition_split
     )
     fields = _fields(job, generator.fields)
     software = {
@@ -127,6 +128,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     resolved = job.model_copy(
         update={
             "model": settle_model(job.model),
+            "condition": condition,
             "fields": fields,
             "objects": settle_objects(generator, job.objects),
             "batch": job.batch or BATCH[job.device],
@@ -138,7 +140,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     labelled = "generated" if "label" in header.channels else "condition"
     reference = {
         "kind": generator.condition,
-        "source": job.condition,
+        "source": condition,
         "layout": job.condition_layout,
         "split": job.condition_split,
         "content": fingerprint(source),
@@ -159,6 +161,11 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
         layout=job.layout,
     )
     return BakePlan(bank_root(out), resolved, facts)
+
+
+def _settle_path(path: str | None) -> str | None:
+    """The path of a dataset from any folder."""
+    return path if path is None or is_url(path) else str(Path(path).resolve())
 
 
 def _fields(job: BakeJob, generated: frozenset[str]) -> tuple[str, ...]:

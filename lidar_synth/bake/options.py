@@ -42,7 +42,8 @@ class BakeJob(BaseModel):
     shard_size: Count | None = Field(
         None,
         description=(
-            "scans per file, which an interrupted bake keeps [an eighth of all, 64 to 1024]"
+            "scans per file, which an interrupted bake keeps; a worker needs the "
+            "memory of two files [an eighth of all, 64 to 1024]"
         ),
     )
     steps: Count | None = Field(None, description="number of steps [the model's own]")

@@ -8,7 +8,6 @@ Several bakes may fill one URL at the same time: the same settings give the same
 do not (on another kind of processor), a shard has two records and counts as missing.
 """
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,6 @@ from lidar_synth.bank.card import CARD, CROISSANT
 from lidar_synth.bank.folder import open_folder
 from lidar_synth.bank.reader import read_index
 from lidar_synth.errors import ConfigError
-from lidar_synth.files.claims import compare
 from lidar_synth.formats.writer import NOTES
 
 SETTINGS = ".bake.json"
@@ -27,17 +25,6 @@ SETTINGS = ".bake.json"
 hold a lock on it."""
 
 _RECORD = re.compile(re.escape(NOTES) + r"/(.+\.h5)-(\d+)-([0-9a-f]{64})")
-
-
-def prepare(plan: BakePlan, url: str) -> None:
-    """Claim a URL for the plan's settings; raises as ``folder.prepare``."""
-    folder = open_folder(url)
-    if SETTINGS not in folder.sizes():
-        refuse_others(url)
-        content = json.dumps(plan.settings, indent=1).encode()
-        folder.write(SETTINGS, content, overwrite=False)
-    wanted = json.loads(json.dumps(plan.settings))
-    compare(folder.read(SETTINGS).decode(errors="replace"), wanted, url, SETTINGS)
 
 
 def refuse_others(root: str | Path) -> None:

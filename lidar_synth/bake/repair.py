@@ -1,7 +1,7 @@
 """Repair of banks: regenerates exactly what is damaged or missing."""
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +10,8 @@ from tqdm import tqdm
 
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.job import BakePlan
+from lidar_synth.bake.making import NOTE
+from lidar_synth.bake.options import BakeJob
 from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.shard import load_checked, write_shard
 from lidar_synth.bake.verify import (
@@ -22,12 +24,17 @@ from lidar_synth.bank import INDEX, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.folder import BankFolder, open_folder
 from lidar_synth.bank.reader import read_index
 from lidar_synth.bank.storage import bank_root, open_storage
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import remove_file
+from lidar_synth.files.lock import one_writer
 
 
 def repair(
-    root: str | Path, model: str | None = None, progress: bool = True
+    root: str | Path,
+    model: str | None = None,
+    progress: bool = True,
+    *,
+    condition: str | None = None,
 ) -> dict[str, str]:
     """Regenerate damaged and missing shards, and rewrite a damaged or missing index, card or
     settings file.
@@ -39,17 +46,49 @@ def repair(
         root: the bank's folder or URL.
         model: the checkpoint, if it is not a shipped model.
         progress: show a bar.
+        condition: the dataset of the conditions, if it has moved.
 
     Returns:
         {file: what was done}; empty if the bank is intact.
 
     Raises:
-        ConfigError: if the checkpoint is not the one that made the scans.
+        ConfigError: if the checkpoint or the conditions are not those that made the scans, or
+            another process fills the folder.
         DataError: if too little is left to determine what the bank held.
         FileError: if a file cannot be read or written.
     """
-    done: dict[str, str] = {}
     place = bank_root(root)
+    with _working_alone(place):
+        done, index, baked = _mend(place, model, condition, progress)
+    # now that its settings are not open: Windows replaces no open file
+    if done:
+        write_bank_files(place, index, baked)
+    return done
+
+
+@contextmanager
+def _working_alone(place: str | Path) -> Iterator[None]:
+    """Keep other processes from filling a folder until the block ends; raises as ``repair``."""
+    claims = (
+        [place / name for name in (SETTINGS, NOTE)] if isinstance(place, Path) else []
+    )
+    with ExitStack() as held:
+        for claim in filter(Path.is_file, claims):
+            with suppress(OSError):  # read-only: nobody fills it
+                if not held.enter_context(one_writer(claim)):
+                    raise ConfigError(
+                        f"{place}, in which another process works",
+                        "a bank that none is filling",
+                        "Wait for it.",
+                    )
+        yield
+
+
+def _mend(
+    place: str | Path, model: str | None, condition: str | None, progress: bool
+) -> tuple[dict[str, str], Index, bool]:
+    """What was done to which file, the index of the mended shards, and whether a bake made them."""
+    done: dict[str, str] = {}
     folder = open_folder(place)
     for part in place.glob(".*.part") if isinstance(place, Path) else ():
         remove_file(part)
@@ -74,7 +113,9 @@ def repair(
             if entry.sha256 and next(check_shard(folder, facts, entry), None) is None:
                 bar.update(entry.scans)
                 continue
-            shards[number] = new = _regenerate(folder, facts, entry, model, bar.update)
+            shards[number] = new = _regenerate(
+                folder, facts, entry, job_of(facts, model, condition), bar.update
+            )
             same = entry.sha256 in ("", new.sha256)
             done[entry.file] = "regenerated" + (
                 "" if same else ", with different bytes"
@@ -84,22 +125,18 @@ def repair(
                     f"{entry.file} was regenerated with torch {torch.__version__}, with different "
                     "bytes"
                 )
-    if done:
-        write_bank_files(
-            place, replace(index, shards=tuple(shards), repairs=tuple(repairs)), baked
-        )
-    return done
+    mended = replace(index, shards=tuple(shards), repairs=tuple(repairs))
+    return done, mended, baked
 
 
 def _regenerate(
     folder: BankFolder,
     facts: Facts,
     entry: Entry,
-    model: str | None,
+    job: BakeJob,
     progress: Callable[[int], object],
 ) -> Entry:
     """Generate a shard and replace its file."""
-    job = job_of(facts, model)
     with folder.making(entry.file) as part:
         write_shard(load_checked(job, facts), part, job, facts, entry, progress)
         new = entry.measure(part)

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from lidar_synth.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class Resources:
@@ -13,8 +15,15 @@ class Resources:
         address: address of a Ray cluster; by default Ray starts on this machine.
         slurm: options of submitit for the jobs, for instance {"slurm_partition": "gpu",
             "timeout_min": 240}.
+
+    Raises:
+        ConfigError: on fewer than one worker.
     """
 
     workers: int = 1
     address: str | None = None
     slurm: dict[str, str | int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise ConfigError(f"{self.workers} workers", "at least 1")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import at_work, find_missing, finish, prepare
+from lidar_synth.bake.folder import at_work, find_missing, finish, prepare, release
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.local import bake_local
 from lidar_synth.bake.processes import bake_in_processes
@@ -23,6 +23,7 @@ from lidar_synth.bake.slurm import bake_on_slurm
 from lidar_synth.bake.torchrun import bake_under_torchrun
 from lidar_synth.bank import Index
 from lidar_synth.errors import ConfigError, choose
+from lidar_synth.generate.devices import check_device
 
 Engine = Callable[[BakePlan, Sequence[int], Resources, Progress], None]
 
@@ -79,8 +80,8 @@ def bake(
         The bank's index; None if shards of another run are still missing.
 
     Raises:
-        ConfigError: on an unknown engine, fewer than one worker, or a folder of a bake with other
-            settings.
+        ConfigError: on an unknown engine, a device that is not available, or a folder of a bake
+            with other settings.
         FileError: if the folder cannot be written or the disk is full; finished shards are kept.
         LibraryError: if the engine's library is not installed.
         KeyboardInterrupt: on SIGINT or SIGTERM; finished shards are kept.
@@ -88,10 +89,10 @@ def bake(
     run = choose("engine", engine, ENGINES)
     resources = resources or Resources()
     share = share or Share()
-    if resources.workers < 1:
-        raise ConfigError(f"{resources.workers} workers", "at least 1")
-    prepare(plan)
-    with _terminated_as_interrupted():
+    if engine not in ("ray", "slurm"):  # whose devices are in other machines
+        check_device(plan.job.device)
+    plan = prepare(plan)
+    with _terminated_as_interrupted(), _releasing(plan):
         with at_work(plan):
             mine = range(len(plan.shards))[share.index :: share.of]
             checked = tqdm(
@@ -110,6 +111,16 @@ def bake(
                 ) as bar:
                     run(plan, missing, resources, bar.update)
         return finish(plan)
+
+
+@contextmanager
+def _releasing(plan: BakePlan) -> Iterator[None]:
+    """Take back the claim of the folder after an error before the first shard."""
+    try:
+        yield
+    except BaseException:
+        release(plan)
+        raise
 
 
 @contextmanager

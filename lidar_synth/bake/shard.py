@@ -1,7 +1,6 @@
 """Writes one shard of a plan; every engine runs this."""
 
 import math
-import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +23,7 @@ from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.bank.folder import open_folder
 from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.files.processes import usable_cores
 from lidar_synth.generate.generator import BATCH, Generator
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.scan import RangeImage
@@ -83,7 +83,7 @@ def write_shard(
     names = condition_names(_source(job), range(entry.first, entry.first + entry.scans))
     # One thread compresses 250 scans/s, more than a CPU generates; the number of threads changes no
     # byte.
-    compressors = job.threads if job.device == "cpu" else min(16, os.cpu_count() or 1)
+    compressors = job.threads if job.device == "cpu" else min(16, usable_cores())
     writer = ShardWriter(path, facts, entry, conditions=names, threads=compressors)
     with torch_threads(job.threads), writer:
         for image in images(generator, job, entry):
@@ -175,7 +175,7 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
         raise ConfigError(
             f"conditions {job.condition}, which have changed since the bank was begun",
             "the files, or the names of scans, of its first shard",
-            "Restore them, or bake into another folder.",
+            "Restore them, name their dataset with --condition, or bake into another folder.",
         )
     return generator
 

@@ -137,6 +137,7 @@ def regenerate(
     progress: bool = True,
     *,
     seed: int | None = None,
+    condition: str | None = None,
 ) -> dict[str, float]:
     """Regenerate some scans from their seeds and compare them with the bank.
 
@@ -146,13 +147,14 @@ def regenerate(
         sample: number of scans, sampled from the bank.
         progress: show a bar.
         seed: seed of the sampling, >= 0; by default every call samples others.
+        condition: the dataset of the conditions, if it has moved.
 
     Returns:
         {id: share of cells that agree}; less than ``AGREE`` means that the scan does not belong to
         its id.
 
     Raises:
-        ConfigError: if the checkpoint is not the one that made the scans.
+        ConfigError: if the checkpoint or the conditions are not those that made the scans.
         FileError, DataError: if the bank or the checkpoint cannot be read.
     """
     bank = Bank(root)
@@ -165,7 +167,7 @@ def regenerate(
     for number in tqdm(chosen, desc="regenerate", unit="scan", disable=not progress):
         name = bank.ids[number]
         facts = bank.facts_of(number)
-        job = job_of(facts, model)
+        job = job_of(facts, model, condition)
         generator = load_checked(job, facts)
         with torch_threads(job.threads):
             index = int(name.rpartition("/")[2])
@@ -184,12 +186,15 @@ def agreement(one: RangeImage, other: RangeImage) -> float:
     return float(same.mean())
 
 
-def job_of(facts: Facts, model: str | None = None) -> BakeJob:
+def job_of(
+    facts: Facts, model: str | None = None, condition: str | None = None
+) -> BakeJob:
     """The settings that regenerate a bank's scans.
 
     Args:
         facts: facts of the bank.
         model: the checkpoint, if it is not a shipped model.
+        condition: the dataset of the conditions, if it has moved.
 
     Raises:
         DataError: if the facts hold no valid settings.
@@ -205,6 +210,7 @@ def job_of(facts: Facts, model: str | None = None) -> BakeJob:
         "compression": facts.compression,
         "layout": facts.layout,
         "fields": facts.fields,
+        "condition": condition or facts.settings.get("condition"),
     }
     try:
         return BakeJob(**facts.settings | stored, model=model or facts.model)

@@ -30,7 +30,9 @@ def card_files(
     of ``dataset_card``."""
     return {
         CARD: dataset_card(name, index, place, licence).encode(),
-        CROISSANT: (json.dumps(croissant(name, index), indent=1) + "\n").encode(),
+        CROISSANT: (
+            json.dumps(croissant(name, index, licence), indent=1) + "\n"
+        ).encode(),
     }
 
 
@@ -48,7 +50,7 @@ def summary(index: Index) -> dict[str, Any]:
         "range": f"{facts.sensor.range_min:g} to {facts.sensor.range_max:g} m in steps of "
         f"{facts.encoding.scale * 1000:.2f} mm",
         "fields": ", ".join(facts.fields) or "none",
-        "label policy": facts.label_policy,
+        "label policy": _each(source.label_policy for source in index.sources),
         "model": _each(map(_maker, index.sources)),
         "data": _each(
             source.provenance.get("data", "unknown") for source in index.sources
@@ -116,7 +118,7 @@ def dataset_card(
     fields = index.sources[0].fields
     lines = [
         *front_matter(
-            [licence or facts.licence for facts in index.sources],
+            _licences(index, licence),
             pretty_name=name,
             task_categories=[TASKS[field] for field in fields if field in TASKS],
             size_categories=[_size(index.scans)],
@@ -141,6 +143,12 @@ def dataset_card(
     return "\n".join(lines) + "\n"
 
 
+def _licences(index: Index, licence: str | None) -> list[str]:
+    """The given licence, or the distinct ones of the sources."""
+    own = dict.fromkeys(facts.licence for facts in index.sources)
+    return [licence] if licence else [*own]
+
+
 def _size(scans: int) -> str:
     """The hub's category of a number of scans."""
     limits = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K"}
@@ -148,9 +156,11 @@ def _size(scans: int) -> str:
     return next((name for most, name in limits.items() if scans < most), "n>10M")
 
 
-def croissant(name: str, index: Index) -> dict[str, Any]:
-    """The bank's files, with their hashes, as JSON-LD of Croissant 1.0."""
+def croissant(name: str, index: Index, licence: str | None = None) -> dict[str, Any]:
+    """The bank's files, with their hashes, as JSON-LD of Croissant 1.0; the arguments are those of
+    ``dataset_card``."""
     facts = index.sources[0]
+    licences = _licences(index, licence)
     return {
         "@context": {
             "@language": "en",
@@ -166,7 +176,7 @@ def croissant(name: str, index: Index) -> dict[str, Any]:
         "description": (
             f"{index.scans} LiDAR scans of {facts.sensor.name}. {_origin(index)}"
         ),
-        "license": facts.licence,
+        "license": licences[0] if len(licences) == 1 else licences,
         "version": "1.0.0",
         "distribution": [
             {

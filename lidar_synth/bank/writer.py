@@ -26,8 +26,8 @@ _PENDING = 8  # scans per thread that may wait to be written
 
 
 class ShardWriter:
-    """Writes one shard. It is built in memory, and its file is complete only after ``close`` has
-    returned.
+    """Writes one shard. It is built in memory, of which ``close`` takes twice the size of the file,
+    and its file is complete only after ``close`` has returned.
 
     Args:
         path: path of the file; an existing file is overwritten.

@@ -70,7 +70,7 @@ def bake(
         bool,
         typer.Option(
             "--dry-run",
-            help="print the size of the bank and the time it takes, without baking",
+            help="print the size of the bank and the time and memory it takes, without baking",
         ),
     ] = False,
     **settings: Any,
@@ -92,8 +92,10 @@ def bake(
       torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 \\
           --device cuda --engine torchrun
     """
+    from lidar_synth.bake import ENGINES, make_plan
     from lidar_synth.bake import bake as run
-    from lidar_synth.bake import make_plan
+    from lidar_synth.bake.folder import check_settings
+    from lidar_synth.errors import choose
     from lidar_synth.files.recipes import find_recipe, read_recipe, validate
 
     values = {} if config is None else read_recipe(find_recipe(config))
@@ -102,15 +104,17 @@ def bake(
     plan = make_plan(
         out, validate(BakeJob, values, "bake" if config is None else str(config))
     )
+    resources = _resources(plan, workers, address, slurm)
     if dry_run:
-        _describe(plan)
+        choose("engine", engine, ENGINES)
+        _describe(check_settings(plan))
         return
     quiet = os.environ.get("LOCAL_RANK", "0") != "0"
     try:
         index = run(
             plan,
             engine,
-            _resources(plan, workers, address, slurm),
+            resources,
             share,
             progress=not quiet,
         )
@@ -178,6 +182,7 @@ def _resources(
 
     from lidar_synth.bake import Resources
     from lidar_synth.errors import ConfigError
+    from lidar_synth.files.processes import usable_cores
 
     options: dict[str, Any] = {}
     for item in slurm or ():
@@ -187,7 +192,8 @@ def _resources(
                 f"--slurm {item!r}", "KEY=VALUE, such as slurm_partition=gpu"
             )
         options[key] = int(value) if value.isdigit() else value
-    devices = torch.cuda.device_count() if plan.job.device == "cuda" else os.cpu_count()
+    cuda = plan.job.device == "cuda"
+    devices = torch.cuda.device_count() if cuda else usable_cores()
     return Resources(workers if workers is not None else devices or 1, address, options)
 
 
@@ -214,4 +220,8 @@ def _describe(plan: "BakePlan") -> None:
     typer.echo(f"  about {disk}, {expected.bytes / job.count / 1e3:.0f} kB per scan")
     typer.echo(
         f"  about {time} with one worker, {job.count / expected.seconds:.2f} scans/s"
+    )
+    shard = size / job.count * max(entry.scans for entry in shards)
+    typer.echo(
+        f"  up to {2 * shard:.3g} MB of memory a worker for its shard, beside the model"
     )

@@ -5,13 +5,21 @@ from typing import Annotated
 
 import typer
 
+from lidar_synth.cli.options import local_path
+
 BankFolder = Annotated[
     str, typer.Argument(metavar="BANK", help="folder or URL of a bank")
 ]
 Model = Annotated[
     str | None, typer.Option(help="checkpoint file, if it is not a shipped model")
 ]
-Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder of the new bank")]
+Condition = Annotated[
+    str | None, typer.Option(help="dataset of the conditions, if it has moved")
+]
+Out = Annotated[
+    Path,
+    typer.Argument(metavar="OUT", help="folder of the new bank", parser=local_path),
+]
 
 
 def verify(
@@ -29,6 +37,7 @@ def verify(
         int | None, typer.Option(min=0, help="seed that selects these scans [random]")
     ] = None,
     model: Model = None,
+    condition: Condition = None,
 ) -> None:
     """Checks a bank: index, every shard's hash and attributes, every scan, and the card. Exit
     status 1 = damaged.
@@ -58,7 +67,7 @@ def verify(
         return
     seed = secrets.randbits(32) if seed is None else seed
     typer.echo(f"{bank}: scans selected by --seed {seed}")
-    shares = regenerate(bank, model, sample, seed=seed)
+    shares = regenerate(bank, model, sample, seed=seed, condition=condition)
     different = {name: share for name, share in shares.items() if share < AGREE}
     for name, share in different.items():
         typer.echo(
@@ -73,7 +82,7 @@ def verify(
         raise typer.Exit(1)
 
 
-def repair(bank: BankFolder, model: Model = None) -> None:
+def repair(bank: BankFolder, model: Model = None, condition: Condition = None) -> None:
     """Regenerates exactly the damaged or missing shards of a bank, and rewrites a damaged index or
     card.
 
@@ -87,7 +96,7 @@ def repair(bank: BankFolder, model: Model = None) -> None:
     """
     from lidar_synth.bake.repair import repair as run
 
-    done = run(bank, model)
+    done = run(bank, model, condition=condition)
     for file, what in done.items():
         typer.echo(f"{file}: {what}")
     if not done:
@@ -163,7 +172,7 @@ def split(
     for part in parts:
         folder, _, share = part.rpartition("=")
         try:
-            shares[Path(folder)] = float(share)
+            shares[local_path(folder)] = float(share)
         except ValueError as error:
             raise ConfigError(
                 f"part {part!r}", "FOLDER=SHARE, such as train=0.9"

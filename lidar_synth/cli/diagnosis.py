@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from lidar_synth import __version__
+from lidar_synth.files.processes import usable_cores
 
 State = Literal["ok", "absent", "check", "broken"]
 """``absent``: an optional part is missing; ``check``: an optional part does not work; ``broken``:
@@ -248,13 +249,11 @@ def _geometry() -> Finding:
 
 
 def _devices() -> Iterator[Finding]:
-    cores = (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1
-    )
     yield Finding(
-        "devices", "CPU", "ok", f"{_cpu_name()}, {cores} cores{_instructions()}"
+        "devices",
+        "CPU",
+        "ok",
+        f"{_cpu_name()}, {usable_cores()} cores{_instructions()}",
     )
     if hasattr(os, "sysconf"):
         total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30

@@ -148,7 +148,7 @@ def move_object(
     )
 
 
-def _edit_one(source: Path, out: Path, number: int, to: str, change: Any) -> None:
+def _edit_one(source: str, out: Path, number: int, to: str, change: Any) -> None:
     from lidar_synth.formats import open_scans
 
     scans = open_scans(source)

@@ -16,11 +16,29 @@ FORMATS = (
 )
 """Help of ``--to``; names of ``formats.WRITERS``."""
 
+
+def local_path(text: str) -> Path:
+    """The path of a file or folder to write, for typer to parse; a URL, which ``Path`` would turn
+    into a folder ``s3:``, is refused."""
+    if "://" in text:
+        raise typer.BadParameter(
+            f"{text}; expected a folder or file on this machine. Only bake writes to URLs: copy "
+            "the result there afterwards."
+        )
+    return Path(text)
+
+
 Source = Annotated[
-    Path,
-    typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset"),
+    str,
+    typer.Argument(
+        metavar="IN",
+        help="file, folder of scans or root of a dataset; a bank may be at a URL",
+    ),
 ]
-Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
+Out = Annotated[
+    Path,
+    typer.Argument(metavar="OUT", help="folder to write to", parser=local_path),
+]
 Format = Annotated[str, typer.Option(help=FORMATS)]
 
 
@@ -41,7 +59,7 @@ class Reading(BaseModel):
     )
     reflectance_max: float | None = Field(
         None,
-        description="highest reflectance value in plain files, for instance 255 "
+        description="highest reflectance value in plain files and MCAP, for instance 255 "
         "[1; 255 in logs of drivers]",
     )
     on_bad: str | None = Field(

@@ -1,12 +1,11 @@
 """``lidar-synth sample``: generates scans with a model."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import Format
+from lidar_synth.cli.options import Format, Out
 from lidar_synth.datasets.recordings import NOTE, seen_by
 
 if TYPE_CHECKING:
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def sample(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
+    out: Out,
     model: Annotated[
         str, typer.Option(help="name of a shipped model, or a .safetensors checkpoint")
     ] = "town",

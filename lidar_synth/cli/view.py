@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import Reading, drop_missing, options_from
+from lidar_synth.cli.options import Reading, drop_missing, local_path, options_from
 from lidar_synth.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 @options_from(Reading, after="sensor")
 def view(
     path: Annotated[
-        Path, typer.Argument(help="file, folder, root of a dataset, or bank")
+        str,
+        typer.Argument(help="file, folder, root of a dataset, or bank, also its URL"),
     ],
     index: Annotated[
         int, typer.Option(help="number of the first scan, from 0; -1 is the last one")
@@ -24,7 +25,10 @@ def view(
     count: Annotated[int, typer.Option(min=1, max=256, help="number of scans")] = 1,
     out: Annotated[
         Path | None,
-        typer.Option(help="file to write: .png (sheet) or .html (interactive page)"),
+        typer.Option(
+            help="file to write: .png (sheet) or .html (interactive page)",
+            parser=local_path,
+        ),
     ] = None,
     sensor: Annotated[
         str | None,
@@ -53,10 +57,10 @@ def view(
         open_scans(path, sensor=sensor, **drop_missing(reading)), index, count
     )
     if out is None:
-        if show(scans, title=str(path)):
+        if show(scans, title=path):
             return
-        out = Path(f"{path.resolve().stem or 'scans'}-{index}.html")
-    write_view(out, scans, title=path.resolve().name)
+        out = Path(f"{Path(path).resolve().stem or 'scans'}-{index}.html")
+    write_view(out, scans, title=Path(path).resolve().name)
     typer.echo(f"{out}: {len(scans)} of the scans in {path}")
 
 

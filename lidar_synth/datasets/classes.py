@@ -11,6 +11,7 @@ https://www.nuscenes.org/nuscenes#lidarseg, PandaSet's ``classes.json``, Waymo's
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,13 @@ GROUND = np.isin(
     [TRAIN_ID[n] for n in ("road", "parking", "sidewalk", "other-ground", "terrain")],
 )
 """(256,) whether a label, uint8, is of the ground."""
+
+
+def has_ground(label: NDArray[np.uint8] | None) -> TypeGuard[NDArray[np.uint8]]:
+    """Whether any of the labels (N,) is of the ground; those of objects that were pasted into an
+    unlabelled scan do not tell where its ground is."""
+    return label is not None and bool(GROUND[label].any())
+
 
 BOXED = tuple(
     TRAIN_ID[name]

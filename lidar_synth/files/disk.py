@@ -318,6 +318,18 @@ def list_files(folder: Path, *suffixes: str) -> list[Path]:
     return [folder / name for name in names]
 
 
+def files_below(folder: Path) -> Iterator[Path]:
+    """All files in a folder and its subfolders, in any order.
+
+    Links to folders are followed, except to a folder above the link, which would never end.
+    """
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        here = Path(parent)
+        above = {path.resolve() for path in (here, *here.parents)}
+        folders[:] = [name for name in folders if (here / name).resolve() not in above]
+        yield from (here / name for name in names)
+
+
 def read_values(path: Path, dtype: str) -> NDArray[Any]:
     """Read (N,) values of one type from a raw file.
 

@@ -49,6 +49,14 @@ def _next(item: Any) -> Any:
         _busy = False
 
 
+def usable_cores() -> int:
+    """Number of CPU cores that this process may use: a batch system or container may allow it
+    fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):  # not on Windows and macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 @contextmanager
 def defer_signals(*numbers: int) -> Iterator[None]:
     """Defer signals to the end of the block, in which processes start. These do not get Ctrl-C,

@@ -116,8 +116,8 @@ def open_scans(
         layout: one of ``READERS``; by default it is recognised from the files.
         split: name of a split, if the layout has splits.
         fields: floats per point of plain ``.bin`` files.
-        reflectance_max: maximum of the reflectance in plain files, such as 255; values are divided
-            by it.
+        reflectance_max: maximum of the reflectance in plain files and MCAP, such as 255; values are
+            divided by it.
         on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` skips it, with a
             warning; ``"drop-points"`` drops points that are NaN or infinite, and counts them.
 
@@ -152,17 +152,14 @@ def open_scans(
         "reflectance_max": reflectance_max,
     }
     options = {key: value for key, value in given.items() if value is not None}
-    if "split" in options and "split" not in taken:
-        raise ConfigError(
-            f"split {split!r} of {path}", f"no split: layout {name!r} has none"
-        )
-    plain = [f"{k}={v}" for k, v in options.items() if k not in ("sensor", "split")]
-    if plain and "fields" not in taken:
-        raise ConfigError(
-            f"{', '.join(plain)} for {path}",
-            f"neither: layout {name!r} has a fixed file format",
-            _AS_FOLDER,
-        )
+    for key, value in options.items():
+        if key not in taken:
+            plain = key in inspect.signature(Folder).parameters
+            raise ConfigError(
+                f"{key}={value!r} for {path}",
+                f"no {key}: layout {name!r} has none",
+                _AS_FOLDER if plain and Folder.recognises(Path(path)) else "",
+            )
     return reader(path, on_bad=on_bad, **options)  # type: ignore[arg-type]
 
 

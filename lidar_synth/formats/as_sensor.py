@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan, Source
@@ -120,14 +120,10 @@ def make_transfer(
     Raises:
         ConfigError, FileError, DataError: on a sensor, a mount or scans that there cannot be.
     """
-    from lidar_synth.formats import open_scans
-
     target = load_sensor(sensor)
     response = None
     if like is not None:
-        if isinstance(like, str | Path):
-            like = open_scans(like, sensor=target)
-        response = Response.match(_some(scans), _some(like))
+        response = Response.match(_some(scans), _real(like, target))
     return Transfer(target, Mount(*mount), Measurement(**measured, response=response))
 
 
@@ -163,6 +159,25 @@ def read_transfer(given: Any, scans: Any) -> Any:
             "down], like: a folder of real scans",
         )
     return make_transfer(values["sensor"], tuple(mount), values["like"], scans)
+
+
+def _real(like: str | Path | Source, target: Sensor) -> list[Scan]:
+    """Some of the real scans of a sensor; an error for a folder that needs options says what to
+    do."""
+    from lidar_synth.formats import open_scans
+
+    if not isinstance(like, str | Path):
+        return _some(like)
+    source = open_scans(like, sensor=target)
+    try:
+        return _some(source)
+    except DataError as error:
+        raise DataError(
+            f"--like {like} (like=...), which is read without further options",
+            "scans that need none",
+            f"Convert them first, with those that they need: lidar-synth convert {like} OUT --to "
+            f"npz --sensor {target.name}; then give OUT. {error}",
+        ) from error
 
 
 def _some(scans: Any) -> list[Scan]:

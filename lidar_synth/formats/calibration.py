@@ -1,4 +1,5 @@
-"""Camera calibration: the projection of points from the sensor frame into a camera's image."""
+"""Camera calibration: the projection of points from the sensor frame into a camera's image, and the
+part of a scan that the camera sees."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import LARGEST_IMAGE
+from lidar_synth.geometry.scan import Scan
 
 Matrix = NDArray[np.float64]
 
@@ -83,6 +85,32 @@ class Calibration:
                 depth[:, None] > 0, homogeneous[:, :2] / depth[:, None], np.nan
             )
         return pixels, depth
+
+
+def in_view(scan: Scan, camera: Calibration) -> Scan:
+    """Crop a scan to a camera's image: the points that project into it, and the boxes whose centres
+    do or that hold such points, as KITTI labels objects that the image's edge cuts.
+
+    Raises:
+        DataError: if the camera's image size is unknown.
+    """
+    size = camera.image_size
+    if size is None:
+        raise DataError("a camera without image size", "width and height, from image_2")
+
+    def seen(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        pixels, depth = camera.pixels(points)
+        with np.errstate(invalid="ignore"):
+            inside: NDArray[np.bool_] = (
+                (pixels >= 0).all(1) & (pixels < np.array(size)).all(1) & (depth > 0)
+            )
+        return inside
+
+    part = scan[seen(scan.points)]
+    if scan.boxes is not None:
+        held = scan.boxes.contain(part.points).any(1)
+        part.boxes = scan.boxes[seen(scan.boxes.values[:, :3]) | held]
+    return part
 
 
 def check_rigid(transforms: Matrix, where: str) -> None:

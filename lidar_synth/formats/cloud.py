@@ -8,7 +8,8 @@ PLY reader supports unsigned 32-bit values.
 The logs of drivers have other names and types, which are read too: ``ring`` or ``channel`` of any
 integers, the time as ``time`` (float32 seconds), ``t`` or ``time_stamp`` (nanoseconds) or
 ``timestamp``, and Ouster's ``reflectivity``, which is calibrated and takes precedence over its
-``intensity``, the number of photons.
+``intensity``, the number of photons. Names of the reflectance may have capitals, and CloudCompare's
+prefix ``scalar_``.
 """
 
 import io
@@ -44,17 +45,17 @@ IN_MEMORY = {
     "cause": "u1",
 }
 
-REFLECTANCES = ("reflectivity", "intensity", "reflectance")
+REFLECTANCES = ("reflectivity", "intensity", "reflectance", "remission", "i")
 RINGS = ("ring", "channel")
 TIMES = ("t", "time_stamp", "timestamp")
-"""Names of a field in the logs of drivers, of which the first one counts."""
+"""Names of a field in the files of drivers and other programs, of which the first one counts."""
 
 LONGEST_TURN = 1.05
 """Seconds from the first to the last point of a scan, by which the unit of float times is
 recognised."""
 
-WANTED = ("x", "y", "z", *REFLECTANCES, *STORED, "channel", *TIMES)
-"""The fields that are read from a file; all others are ignored."""
+WANTED = ("x", "y", "z", *STORED, "channel", *TIMES)
+"""The fields that are read from a file beside its reflectance; all others are ignored."""
 
 WIDEST = 1 << 20
 """Maximum number of bytes of one point."""
@@ -78,6 +79,16 @@ class Field:
     def width(self) -> int:
         """Bytes per point."""
         return np.dtype(self.type).itemsize * self.count
+
+    @property
+    def wanted(self) -> bool:
+        """Whether it is read."""
+        return self.name in WANTED or _plain(self.name) in REFLECTANCES
+
+
+def _plain(name: str) -> str:
+    """The name of a reflectance without capitals and prefix."""
+    return name.lower().removeprefix("scalar_")
 
 
 def size_error(where: str, held: int, wanted: int, unit: str = "bytes") -> DataError:
@@ -109,9 +120,9 @@ def check_fields(fields: Sequence[Field], count: int, where: str) -> None:
         DataError: if x, y or z is missing, a wanted field occurs twice or has several values per
             point, a point has more than ``WIDEST`` bytes, or there are no points.
     """
-    names = [field.name for field in fields if field.name in WANTED]
+    names = [field.name for field in fields if field.wanted]
     if len(set(names)) < len(names) or any(
-        field.count != 1 for field in fields if field.name in WANTED
+        field.count != 1 for field in fields if field.wanted
     ):
         raise DataError(
             f"{where} has the fields {names} twice or with several values",
@@ -137,7 +148,7 @@ def from_records(
     wanted = []
     offset = 0
     for field in fields:
-        if field.name in WANTED:
+        if field.wanted:
             wanted.append((field.name, field.type, offset))
         offset += field.width
     names, types, offsets = (list(column) for column in zip(*wanted, strict=True))
@@ -175,7 +186,7 @@ def from_text(
     arrays = {}
     column = 0
     for field in fields:
-        if field.name in WANTED:
+        if field.wanted:
             arrays[field.name] = _typed(table[:, column], field, where)
         column += field.count
     return arrays
@@ -200,25 +211,21 @@ def _typed(values: NDArray[np.float64], field: Field, where: str) -> NDArray[Any
 
 
 def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Rename and convert a file's fields to those of a ``Scan``.
+    """Rename and convert a file's fields to those of a ``Scan``, as far as it has them.
 
     Labels and the like are read only if they have the type of ``STORED``; other programs use the
     names otherwise.
     """
     with np.errstate(over="ignore"):
         points = np.column_stack([stored[axis] for axis in "xyz"]).astype(np.float32)
-        intensity = _first(stored, REFLECTANCES)
-        reflectance = (
-            np.zeros(len(points), np.float32)
-            if intensity is None
-            else intensity.astype(np.float32)
-        )
+        grey = _first({_plain(n): stored[n] for n in stored}, REFLECTANCES)
+        reflectance = {} if grey is None else {"reflectance": grey.astype(np.float32)}
     own = [
         n
         for n, kind in STORED.items()
         if n in stored and stored[n].dtype.newbyteorder("<") == np.dtype(kind)
     ]
-    arrays = {"points": points, "reflectance": reflectance} | {
+    arrays = {"points": points, **reflectance} | {
         n: stored[n].astype(IN_MEMORY[n]) for n in own
     }
     ring = _first(stored, RINGS)

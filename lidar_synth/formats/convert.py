@@ -115,9 +115,9 @@ def convert(
         Number of scans written and kept, skipped scans with reasons, and what was left out.
 
     Raises:
-        ConfigError: on fewer than one job, an output folder with the scans of another conversion or
-            sensor, or a source whose points are not those of its sensor; with ``strict``, on a scan
-            that would lose something.
+        ConfigError: on fewer than one job, an output folder that is the source's or has the scans
+            of another conversion or sensor, or a source whose points are not those of its sensor;
+            with ``strict``, on a scan that would lose something.
         FileError: if the output cannot be written, for any ``on_bad``.
         DataError: on a bad scan, unless ``on_bad="skip"``; if what lies beside the scans is
             damaged.
@@ -126,6 +126,10 @@ def convert(
         raise ConfigError(f"{jobs} jobs", "at least 1")
     change = _change(as_sensor)
     if isinstance(source, ScanFiles):
+        if source.root.resolve() == writer.root.resolve():
+            raise ConfigError(
+                f"{writer.root} as source and output", "another folder for the output"
+            )
         source.check_sensor()  # both first, so that a wrong sensor leaves no settings behind
         target = source.sensor if change is None else change.transfer.target
         writer.require_grid(target.by_beams() if unfold else target)

@@ -8,12 +8,15 @@ one such file.
 - ``.pcd``, ``.ply``: see pcd.py and ply.py; optional ``NAME.boxes.json`` with the fields of
   ``Boxes`` as lists.
 
-Files in subfolders are included; a scan's id is its relative path without the suffix.
+Files in subfolders, and in those that links lead to, are included; a scan's id is its relative path
+without the suffix.
 """
 
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import fields
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +25,9 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.disk import read_text, write_file
+from lidar_synth.files.disk import files_below, read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_arrays
+from lidar_synth.formats.cloud import REFLECTANCES
 from lidar_synth.formats.description import Description
 from lidar_synth.formats.npz import (
     check_numbers,
@@ -38,6 +42,7 @@ from lidar_synth.formats.points import check_scan, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import DETAILS, LABELS, FileWriter
 from lidar_synth.geometry.assign import assign_beams
+from lidar_synth.geometry.projection.unfold import rows_by_elevation
 from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -49,6 +54,9 @@ SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 BOXES = ".boxes.json"
 """Suffix of the boxes beside a file of points."""
 
+_OURS = ("label", "confidence", "cause")
+# fields of clouds that mean something else in files of other programs
+
 
 class Folder(ScanFiles):
     """A folder of .bin, .npy, .npz, .pcd or .ply files, one kind only, or one such file.
@@ -57,12 +65,15 @@ class Folder(ScanFiles):
         root: the folder or the file.
         sensor: the sensor that recorded the scans; by default the one that the files name
             (``.npz``, ``.pcd`` and ``.ply`` files of this package), or ``scans.json`` beside them,
-            or else ``hdl64e_kitti``.
+            or else ``hdl64e_kitti``, except for ``.npz`` files.
         fields: floats per point of ``.bin`` files.
         reflectance_max: maximum of the reflectance in the files; values are divided by it. By
             default 1, and 255 in scans of PCD and PLY logs of a driver that hold more than 1: those
             have rings and no description of ours.
         on_bad: see ``ScanFiles``.
+
+    Files of other programs have no labels of ours: ``label``, ``confidence`` and ``cause`` of PCD
+    and PLY files without our description are ignored.
 
     Raises:
         FileError: if the path does not exist.
@@ -76,7 +87,7 @@ class Folder(ScanFiles):
     @classmethod
     def recognises(cls, root: Path) -> bool:
         """See ``ScanFiles.recognises``."""
-        return any(path.suffix.lower() in SUFFIXES for path in (root, *root.rglob("*")))
+        return has_files(root, SUFFIXES)
 
     def __init__(
         self,
@@ -87,11 +98,9 @@ class Folder(ScanFiles):
         reflectance_max: float | None = None,
         on_bad: OnBad = "error",
     ) -> None:
-        if fields < 4 or not (reflectance_max is None or 0 < reflectance_max < np.inf):
-            raise ConfigError(
-                f"fields={fields}, reflectance_max={reflectance_max}",
-                "at least 4, and above 0",
-            )
+        if fields < 4:
+            raise ConfigError(f"fields={fields}", "at least 4")
+        check_scale(reflectance_max)
         root = Path(root)
         base, self._paths = scan_paths(root, SUFFIXES)
         ids = [
@@ -125,52 +134,73 @@ class Folder(ScanFiles):
             )
             scan = Scan(points[:, :3], points[:, 3], self.sensor, **labels)
         elif suffix == ".npz":
-            scan = decode_scan(
-                read_arrays(path),
-                str(path),
-                self.sensor if self._unknown else self._given,
-            )
-            check_scan(scan, str(path))
-            return scan
+            stored = read_arrays(path)
+            known = self.sensor if self._unknown else self._named
+            own = "sensor" in stored
+            scan = decode_scan(stored, str(path), self._given if own else known)
+            check_scan(scan, str(path), scale)
         else:
-            arrays: dict[str, Any] = ARRAYS[suffix](path)
+            arrays = ARRAYS[suffix](path)
             said = _description(path)
-            scan = Scan(
-                sensor=self._given or (said.sensor if said else None) or self.sensor,
-                **arrays,
-            )
-            scan = said.origin.apply(scan) if said else drop_empty_firings(scan)
-            scan.boxes = read_boxes(path)
-            given = self._given is not None
-            return as_unit_reflectance(
-                scan, said is not None, str(path), self._reflectance_max, given
-            )
+            sensor = self._given or (said and said.sensor) or self.sensor
+            most = self._reflectance_max
+            return as_scan(arrays, said, sensor, path, most, not self._unknown)
         if scale != 1:
             scan.reflectance = scan.reflectance / np.float32(scale)
         return scan
 
 
-def as_unit_reflectance(
-    scan: Scan, described: bool, where: str, most: float | None, given: bool
-) -> Scan:
-    """A checked scan of a cloud with reflectance from 0 to 1, and with the sensor's rings.
-
-    Args:
-        scan: as the file has it.
-        described: whether this package wrote it; other clouds with rings are logs of drivers.
-        where: of the scan, for messages.
-        most: maximum of the reflectance in the file, if it is known.
-        given: whether the user named the sensor.
+def check_scale(reflectance_max: float | None) -> None:
+    """Refuse a maximum of the reflectance that there cannot be.
 
     Raises:
-        DataError: on a scan with invalid values.
+        ConfigError: on one that is not above 0 and finite.
     """
-    is_log = not described and scan.ring is not None
+    if not (reflectance_max is None or 0 < reflectance_max < np.inf):
+        raise ConfigError(f"reflectance_max={reflectance_max}", "above 0")
+
+
+def as_scan(
+    arrays: dict[str, Any],
+    said: Description | None,
+    sensor: Sensor,
+    path: Path,
+    most: float | None,
+    known: bool,
+) -> Scan:
+    """The checked scan of a cloud, with reflectance from 0 to 1, the sensor's rings, and the boxes
+    beside its file.
+
+    Args:
+        arrays: as the file has them.
+        said: what this package wrote about it; other clouds with rings are logs of drivers.
+        sensor: of the scan.
+        path: of the file.
+        most: maximum of the reflectance in the file, if it is known.
+        known: whether the sensor is known, so that rings become its rows.
+
+    Raises:
+        DataError: on a scan with invalid values, or damaged boxes.
+        FileError: if the boxes cannot be read.
+    """
+    if "reflectance" not in arrays:
+        warnings.warn(
+            f"the points in {path.parent} have no reflectance (no field "
+            f"{', '.join(REFLECTANCES)}): it is read as 0",
+            stacklevel=2,
+        )
+        arrays["reflectance"] = np.zeros(len(arrays["points"]), np.float32)
+    if said is None:
+        arrays = {name: a for name, a in arrays.items() if name not in _OURS}
+    scan = Scan(sensor=sensor, **arrays)
+    scan = drop_empty_firings(scan) if said is None else said.origin.apply(scan)
+    scan.boxes = read_boxes(path)
+    is_log = said is None and scan.ring is not None
     scale = most or 1.0
     if is_log and most is None and np.nanmax(scan.reflectance, initial=0) > 1:
         scale = LOG_REFLECTANCE
-    check_scan(scan, where, scale)
-    if is_log and given:
+    check_scan(scan, str(path), scale)
+    if is_log and known:
         scan.ring = rows_of_rings(scan)
     if scale != 1:
         scan.reflectance = scan.reflectance / np.float32(scale)
@@ -221,17 +251,25 @@ def rows_of_rings(scan: Scan) -> NDArray[np.int16]:
     """(N,) the row of the sensor for each ring: drivers count from below, or in the order of the
     lasers.
 
-    A ring is the row that is nearest to most of its points.
+    Each ring gets a row of its own: from the highest to the lowest median elevation, those that
+    fit best. More rings than rows, as of another sensor, keep their numbers. Points that are not
+    finite do not count.
     """
     assert scan.ring is not None
-    _, number = np.unique(scan.ring, return_inverse=True)
-    rows = scan.sensor.shape[0]
-    votes = np.bincount(
-        number * rows + assign_beams(scan).ring,
-        minlength=rows * (int(number.max()) + 1),
-    )
-    nearest = votes.reshape(-1, rows).argmax(axis=1)
-    return np.asarray(nearest[number], np.int16)
+    names, number = np.unique(scan.ring, return_inverse=True)
+    beams, _ = scan.sensor.optics()
+    if len(names) > len(beams):
+        return scan.ring
+    good = np.flatnonzero(np.isfinite(scan.points).all(axis=1))
+    order = good[np.argsort(number[good], kind="stable")]
+    there, starts = np.unique(number[order], return_index=True)
+    found = assign_beams(scan[order])
+    elevation = beams[found.ring] + np.radians(found.off)  # as seen from the laser
+    middle = np.array([np.median(part) for part in np.split(elevation, starts[1:])])
+    downward = np.argsort(-middle)
+    rows = np.zeros(len(names), np.int16)
+    rows[there[downward]] = rows_by_elevation(middle[downward], beams)
+    return rows[number]
 
 
 def _columns(path: Path) -> dict[str, NDArray[Any]]:
@@ -279,6 +317,12 @@ def _named_sensor(path: Path) -> Sensor | None:
     return None if said is None else said.sensor
 
 
+def has_files(root: Path, suffixes: tuple[str, ...]) -> bool:
+    """Whether a path is a file with one of the suffixes, or a folder with such a file."""
+    paths = chain([root], files_below(root))
+    return any(path.suffix.lower() in suffixes for path in paths)
+
+
 def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]:
     """The folder to which names are relative, and the paths of the scans in order.
 
@@ -295,7 +339,7 @@ def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]
         return root.parent, [root]
     if not root.is_dir():
         raise FileError(f"{root} does not exist", "a file or a folder with scans")
-    found = (path for path in root.rglob("*") if path.suffix.lower() in suffixes)
+    found = (path for path in files_below(root) if path.suffix.lower() in suffixes)
     paths = sorted(
         p
         for p in found

@@ -260,6 +260,9 @@ def _objects(
     frame: int, boxes: Boxes, pose: NDArray[np.float64]
 ) -> list[ElementTree.Element]:
     nodes = []
+    # Numbers for unknown instances: no other box of the frame has them, whatever its class.
+    numbered = boxes.instance % MAX_INSTANCES
+    free = iter(np.setdiff1d(np.arange(1, 2 * len(boxes) + 1), numbered))
     for i, (x, y, z, length, width, height, yaw) in enumerate(
         boxes.values.astype(np.float64)
     ):
@@ -274,7 +277,7 @@ def _objects(
             height,
         )
         local[:3, 3] = x, y, z
-        instance = int(boxes.instance[i]) if boxes.instance[i] >= 0 else i + 1
+        instance = int(boxes.instance[i] if boxes.instance[i] >= 0 else next(free))
         instance -= (
             image_id * MAX_INSTANCES if instance // MAX_INSTANCES == image_id else 0
         )

@@ -9,9 +9,11 @@ Layout (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme):
     training/image_2/FFFFFF.png          left colour camera
     testing/                             the same without label_2
     ImageSets/train.txt, val.txt ...     frame numbers of each split
+    mapping/train_mapping.txt, train_rand.txt    the drive of each frame, from the devkit
 """
 
 import re
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +30,12 @@ from lidar_synth.files.disk import (
     write_file,
     write_named_matrices,
 )
-from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
+from lidar_synth.formats.calibration import (
+    Calibration,
+    homogeneous,
+    ideal_camera,
+    in_view,
+)
 from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -99,6 +106,7 @@ class KITTIObject(ScanFiles):
     ) -> None:
         root = Path(root)
         self._velodyne = "velodyne_reduced" if reduced else "velodyne"
+        self._cropped = False
         parts = choose("KITTI object split", split, SPLITS)
         image_set = root / "ImageSets" / f"{split}.txt"
         if split != "all" and image_set.is_file():
@@ -118,38 +126,93 @@ class KITTIObject(ScanFiles):
             ]
         super().__init__(root, ids, sensor, on_bad)
 
+    def with_boxes(self) -> "KITTIObject":
+        """The scans with boxes, cropped to the view of camera 2: KITTI has boxes nowhere else, so
+        that a detector would learn that objects outside of the view are background.
+
+        Raises:
+            DataError: if no scan has boxes.
+        """
+        ids = [
+            name for name in self.ids if self._file(name, "label_2", ".txt").is_file()
+        ]
+        if not ids:
+            raise DataError(f"{self.root} without boxes", "training/label_2")
+        part = copy(self)
+        part.ids = tuple(ids)
+        part._cropped = True
+        return part
+
+    @property
+    def beyond_view(self) -> bool:
+        """Whether its scans have points outside of the camera's view, where KITTI has no boxes."""
+        return not self._cropped and self._velodyne == "velodyne"
+
+    @property
+    def drives(self) -> tuple[str, ...] | None:
+        """The drive of each scan, by the devkit's ``mapping`` beside ``training``; None without it:
+        the frames' numbers are shuffled and do not tell.
+
+        Raises:
+            DataError: if the files of ``mapping`` do not fit together.
+        """
+        folder = self.root / "mapping"
+        if not folder.is_dir():
+            return None
+        order = read_text(folder / "train_rand.txt").replace(",", " ").split()
+        rows = read_text(folder / "train_mapping.txt").splitlines()
+        try:
+            found = {
+                f"training/{frame:06d}": rows[int(line) - 1].split()[1]
+                for frame, line in enumerate(order)
+            }
+        except (ValueError, IndexError) as error:
+            raise DataError(
+                f"{folder}: {error}",
+                "train_rand.txt and train_mapping.txt of the devkit",
+            ) from error
+        return tuple(found.get(name, name.partition("/")[0]) for name in self.ids)
+
+    def _file(self, name: str, folder: str, suffix: str) -> Path:
+        part, frame = name.split("/")
+        return self.root / part / folder / f"{frame}{suffix}"
+
     def read(self, index: int) -> Scan:
-        part, frame = self.ids[index].split("/")
-        folder = self.root / part
-        points = read_points(folder / self._velodyne / f"{frame}.bin")
-        labels = folder / "label_2" / f"{frame}.txt"
-        image = folder / "image_2" / f"{frame}.png"
+        name = self.ids[index]
+        points = read_points(self._file(name, self._velodyne, ".bin"))
+        labels = self._file(name, "label_2", ".txt")
+        image = self._file(name, "image_2", ".png")
         boxes = None
         if labels.is_file():
             boxes = read_label_2(
-                labels, read_calibration(folder / "calib" / f"{frame}.txt")
+                labels, read_calibration(self._file(name, "calib", ".txt"))
             )
-        return Scan(
+        scan = Scan(
             points[:, :3],
             points[:, 3],
             self.sensor,
             boxes=boxes,
             image_path=image if image.is_file() else None,
-            id=self.ids[index],
+            id=name,
         )
+        if not self._cropped:
+            return scan
+        camera = self.calibration(index)
+        assert camera is not None  # boxes are read with it
+        size = camera.image_size or OBJECT_CAMERA.image_size
+        return in_view(scan, replace(camera, image_size=size))
 
     @property
     def options(self) -> dict[str, Any]:
-        return {"velodyne": self._velodyne}
+        own = {"velodyne": self._velodyne}
+        return own | {"cropped": True} if self._cropped else own
 
     def calibration(self, index: int) -> Calibration | None:
-        part, frame = self.ids[index].split("/")
-        path = self.root / part / "calib" / f"{frame}.txt"
+        name = self.ids[index]
+        path = self._file(name, "calib", ".txt")
         if not path.is_file():
             return None
-        return read_calibration(
-            path, png_size(self.root / part / "image_2" / f"{frame}.png")
-        )
+        return read_calibration(path, png_size(self._file(name, "image_2", ".png")))
 
 
 class KITTIObjectWriter(Writer):

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthError
 from lidar_synth.files.disk import open_file, write_file
-from lidar_synth.formats.cloud import WANTED, Field, check_fields, to_arrays, to_records
+from lidar_synth.formats.cloud import Field, check_fields, to_arrays, to_records
 from lidar_synth.formats.description import Description, from_comments, to_comments
 from lidar_synth.formats.folder import (
-    as_unit_reflectance,
-    drop_empty_firings,
-    read_boxes,
+    as_scan,
+    check_scale,
+    has_files,
     scan_paths,
     write_boxes,
 )
@@ -80,11 +80,13 @@ class MCAP(ScanFiles):
         sensor: the sensor that recorded the scans; by default the one that the files name
             (written by this package), or ``scans.json`` beside them, or else ``hdl64e_kitti``.
         topic: of the messages; it is needed where a file has several.
+        reflectance_max: maximum of the reflectance in the files, see ``Folder``.
         on_bad: see ``ScanFiles``.
 
     Raises:
         FileError: if the path does not exist.
-        ConfigError: if a file has several topics with point clouds.
+        ConfigError: if a file has several topics with point clouds; on an invalid
+            ``reflectance_max``.
         DataError: if there is no scan, or a file is damaged or has no index.
         LibraryError: without the extra ``mcap``.
     """
@@ -94,7 +96,7 @@ class MCAP(ScanFiles):
     @classmethod
     def recognises(cls, root: Path) -> bool:
         """See ``ScanFiles.recognises``."""
-        return any(path.suffix.lower() == SUFFIX for path in (root, *root.rglob("*")))
+        return has_files(root, (SUFFIX,))
 
     def __init__(
         self,
@@ -102,8 +104,11 @@ class MCAP(ScanFiles):
         *,
         sensor: str | Path | Sensor | None = None,
         topic: str | None = None,
+        reflectance_max: float | None = None,
         on_bad: OnBad = "error",
     ) -> None:
+        check_scale(reflectance_max)
+        self._reflectance_max = reflectance_max
         root = Path(root)
         base, paths = scan_paths(root, (SUFFIX,))
         self._places: list[MessagePlace] = []
@@ -119,18 +124,19 @@ class MCAP(ScanFiles):
         stored = said.sensor if said else None
         super().__init__(root, ids, sensor, on_bad, stored=stored)
 
+    @property
+    def options(self) -> dict[str, Any]:
+        return {"reflectance_max": self._reflectance_max}
+
     def read(self, index: int) -> Scan:
         place = self._places[index]
         said = self._said[place.path]
         sensor = self._given or (said and said.sensor) or self.sensor
-        arrays: dict[str, Any] = _points(
-            _message(place), f"{place.path}: {self.ids[index]}"
-        )
-        scan = Scan(sensor=sensor, **arrays, id=self.ids[index])
-        scan = drop_empty_firings(scan) if said is None else said.origin.apply(scan)
-        scan.boxes = read_boxes(place.path)
-        given = self._given is not None
-        return as_unit_reflectance(scan, said is not None, str(place.path), None, given)
+        arrays = _points(_message(place), f"{place.path}: {self.ids[index]}")
+        most = self._reflectance_max
+        scan = as_scan(arrays, said, sensor, place.path, most, not self._unknown)
+        scan.id = self.ids[index]
+        return scan
 
 
 class MCAPWriter(FileWriter):
@@ -263,10 +269,15 @@ def _points(message: Any, where: str) -> dict[str, NDArray[Any]]:
     """
     count = message.width * message.height
     order = ">" if message.is_bigendian else "<"
-    wanted = [f for f in message.fields if f.name in WANTED and f.datatype in TYPES]
-    fields = [Field(f.name, order + TYPES[f.datatype], f.count) for f in wanted]
+    given = [  # some publishers leave the count at 0
+        (f.offset, Field(f.name, order + TYPES[f.datatype], max(f.count, 1)))
+        for f in message.fields
+        if f.datatype in TYPES
+    ]
+    offsets = [offset for offset, field in given if field.wanted]
+    fields = [field for _, field in given if field.wanted]
     check_fields(fields, count, where)
-    ends = [f.offset + field.width for f, field in zip(wanted, fields, strict=True)]
+    ends = [at + field.width for at, field in zip(offsets, fields, strict=True)]
     row = message.width * message.point_step
     if (
         max(ends) > message.point_step
@@ -280,7 +291,7 @@ def _points(message: Any, where: str) -> dict[str, NDArray[Any]]:
     names = [field.name for field in fields]
     types = [field.type for field in fields]
     layout: Any = {"names": names, "formats": types, "itemsize": message.point_step}
-    layout["offsets"] = [f.offset for f in wanted]
+    layout["offsets"] = offsets
     data = np.frombuffer(message.data, np.uint8, message.row_step * message.height)
     rows = data.reshape(message.height, message.row_step)[:, :row]
     points = np.frombuffer(rows.tobytes(), np.dtype(layout))

@@ -192,9 +192,10 @@ def range_image(
 
     Raises:
         DataError: on text, NaN, infinite or negative ranges, which would silently become cells
-            without a return; on a shape that does not match the sensor; on labels that are not
-            train ids, and on reflectance or confidence outside [0, 1]. Values of cells without a
-            return are ignored, and set as ``RangeImage`` defines.
+            without a return; if most ranges exceed the sensor's, as in another unit; on a shape
+            that does not match the sensor; on labels that are not train ids, and on reflectance or
+            confidence outside [0, 1]. Values of cells without a return are ignored, and set as
+            ``RangeImage`` defines.
     """
     check_numbers(distance, f"{where}: range")
     with np.errstate(over="ignore"):
@@ -204,6 +205,14 @@ def range_image(
         raise DataError(
             f"{where}: {bad.sum()} cells whose range is negative or not finite",
             "metres, 0 = no return",
+        )
+    far = np.count_nonzero(image.range > sensor.range_max)
+    if 2 * far > np.count_nonzero(image.mask):
+        raise DataError(
+            f"{where}: {far} ranges exceed the {sensor.range_max:g} m of {sensor.name!r}, up to "
+            f"{image.range.max():g}",
+            "metres, 0 = no return",
+            "Divide the files' values if they are in another unit.",
         )
     for name in [n for n in image.channels if n in POINT_FIELDS]:
         values = image.channels[name].copy()

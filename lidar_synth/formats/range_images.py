@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError, choose
+from lidar_synth.files.disk import files_below
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.folder import scan_paths
 from lidar_synth.formats.npz import (
@@ -84,9 +85,9 @@ class RangeImages(ScanFiles):
         paths = (
             [root]
             if root.is_file()
-            else sorted(p for p in root.rglob("*") if p.suffix in (".npz", ".npy"))
+            else sorted(p for p in files_below(root) if p.suffix in SUFFIXES)
         )
-        if not paths or paths[0].suffix not in (".npz", ".npy"):
+        if not paths or paths[0].suffix not in SUFFIXES:
             return False
         try:
             arrays = read_arrays(paths[0])
@@ -116,13 +117,12 @@ class RangeImages(ScanFiles):
         )
         self._suffix = paths[0].suffix
         self._given = None if sensor is None else load_sensor(sensor)
-        said = None if self.description is None else self.description.sensor
-        named = any(known is not None for known in (self._given, stored, said))
         if convention is None:
             of_sensor = {c.sensor: name for name, c in CONVENTIONS.items()}
-            convention = of_sensor.get(self.sensor.name, "kitti") if named else "kitti"
+            named = "" if self._named is None else self._named.name
+            convention = of_sensor.get(named, "kitti")
         self._convention = choose("convention", convention, CONVENTIONS)
-        if not named:
+        if self._named is None:
             self.sensor = load_sensor(self._convention.sensor)
         self.skip_sensor_check()  # the grid is the sensor's: points on its rays agree with any
 
@@ -159,7 +159,8 @@ class RangeImages(ScanFiles):
         path = self._path(index)
         arrays = read_arrays(path)
         if "range" in arrays:
-            return *decode_range_image(arrays, str(path), self._given), None
+            sensor = self._given if "sensor" in arrays else self._named
+            return *decode_range_image(arrays, str(path), sensor), None
         array = arrays.get("image", arrays.get("array"))
         if array is None or array.ndim not in (2, 3):
             held = {name: values.shape for name, values in arrays.items()}

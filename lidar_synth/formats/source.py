@@ -92,7 +92,8 @@ class ScanFiles(ABC):
         )
         named = stored if self.description is None else self.description.sensor
         self._given = None if sensor is None else load_sensor(sensor)
-        self.sensor = self._given or named or load_sensor(self.default_sensor)
+        self._named = self._given or named
+        self.sensor = self._named or load_sensor(self.default_sensor)
         if named is not None and not named.same_grid(self.sensor):
             warnings.warn(
                 f"{root} says that its scans are of sensor {named.name!r}; they are read as those "

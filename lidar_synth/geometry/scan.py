@@ -5,7 +5,7 @@ All of them are in the sensor frame: right-handed, x forward, y left, z up, metr
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sized
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -394,11 +394,16 @@ class Source(Protocol):
 
 def identity_of(source: Any) -> str:
     """A text that identifies a source: its ``identity``, or its class, its length and a hash of its
-    scans' names."""
+    scans' names; of torch's ``Subset``, a hash of its dataset's identity and its indices."""
     if own := getattr(source, "identity", ""):
         return str(own)
-    names = hash_of_names(map(str, getattr(source, "ids", ())))
-    return f"{type(source).__name__}:{len(source)}:{names[:16]}"
+    names = getattr(source, "ids", ())
+    dataset = getattr(source, "dataset", None)
+    indices = getattr(source, "indices", None)
+    if isinstance(dataset, Sized) and isinstance(indices, Iterable):
+        names = (identity_of(dataset), *indices)
+    hashed = hash_of_names(map(str, names))[:16]
+    return f"{type(source).__name__}:{len(source)}:{hashed}"
 
 
 def scan_hash(scan: Scan) -> str:

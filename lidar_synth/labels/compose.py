@@ -18,14 +18,16 @@ from inspect import signature
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, choose
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry.scan import Boxes, Scan, Source
 from lidar_synth.labels import augment
 from lidar_synth.labels.augment import Augmentation
 from lidar_synth.labels.own import check_share
 from lidar_synth.labels.policies import read_policy
 from lidar_synth.weather import CORRUPTIONS, Corruption
+from lidar_synth.weather.corruption import SURFACE
 
 MOVES: dict[str, Callable[..., Scan]] = {
     "yaw": augment.yaw,
@@ -71,8 +73,14 @@ class Step:
         if self.p < 1 and rng.random() >= self.p:
             return scan
         call = self.call or self._make(partial(_draw, rng))
-        scan = call(scan, rng)
-        return scan.noted(self.name, **self.arguments) if self.name in MIXES else scan
+        changed = call(scan, rng)
+        if self.name in MIXES:
+            return changed.noted(self.name, **self.arguments)
+        boxes = changed.boxes
+        if isinstance(call, Corruption) and boxes is not None:
+            lost = _have_returns(boxes, scan) & ~_have_returns(boxes, changed)
+            return replace(changed, boxes=boxes[~lost])
+        return changed
 
     def bind(self, real: Source | None, fields: frozenset[str]) -> "Step":
         """The step with real scans to draw from, if it needs them."""
@@ -117,7 +125,8 @@ class Step:
 class Compose:
     """One augmentation that applies several in order, with one random generator.
 
-    ``scan.augmented`` tells what was drawn.
+    ``scan.augmented`` tells what was drawn. A box that loses all its returns to a corruption is
+    dropped: nothing is left of its object to detect.
 
     Args:
         steps: augmentations, their names, or ``{name: {argument: value, "p": chance}}``.
@@ -186,7 +195,7 @@ def make_augmentation(
     made = given
     if isinstance(given, Mapping) and "compose" in given:
         made = Compose.from_dict(given)
-    elif not callable(given) or isinstance(given, type):
+    elif not callable(given) or isinstance(given, type | Corruption):
         made = Compose(given if isinstance(given, list | tuple) else [given])
     augmentation: Augmentation = made
     return made.bind(real, fields) if hasattr(made, "bind") else augmentation
@@ -202,7 +211,7 @@ def read_step(given: Any) -> Step:
         return given
     if isinstance(given, str):
         return Step(given.lower())
-    if isinstance(given, Corruption):
+    if type(given) in CORRUPTIONS.values():
         values = {f: getattr(given, f.name) for f in fields(given)}
         own = {f.name: v for f, v in values.items() if v != f.default}
         return Step(given.name, own)
@@ -221,6 +230,12 @@ def read_step(given: Any) -> Step:
         "a function, a name, or {name: {argument: value}} such as "
         "{fog: {visibility: 60, p: 0.5}}",
     )
+
+
+def _have_returns(boxes: Boxes, scan: Scan) -> NDArray[np.bool_]:
+    """(M,) whether boxes hold a return that a surface caused."""
+    surface = slice(None) if scan.cause is None else scan.cause == SURFACE
+    return np.asarray(boxes.contain(scan.points[surface]).any(1))
 
 
 def _check_choice(key: str, values: Sequence[Any]) -> Sequence[Any]:

@@ -68,7 +68,7 @@ class Ground(NamedTuple):
 
 def ground_under(scan: Scan, box: NDArray[np.float32]) -> Ground | None:
     """The ground under a box, found by the labels around it, or by the lowest returns if there are
-    no labels.
+    no labels, or the scan has none of the ground.
 
     Args:
         scan: N points.
@@ -120,6 +120,8 @@ def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-d
     for k in range(len(near) if len(labels) else 0):
         labelled |= labels[near[k]] != IGNORE
         ground[k] = is_ground[labels[near[k]]]
+    if labelled and not ground.any():
+        labelled = is_ground[labels].any()  # as ``has_ground``
     if not labelled:
         lowest = _third_lowest(local)
         for k in range(len(near)):

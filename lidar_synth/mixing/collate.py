@@ -22,6 +22,9 @@ from lidar_synth.mixing.items import Item
 Form = Literal["offsets", "padded", "range"]
 """The layout of a batch, see ``Collate``."""
 
+_KEYS = {"points", "label", "confidence", "boxes", "names", "domain", "id"}
+"""Of the items that a batch is made of."""
+
 Unlabelled = Literal["error", "allow"]
 """Whether a batch without any valid label raises an error or is returned."""
 
@@ -76,8 +79,18 @@ class Collate:
         """Make a batch of the items.
 
         Raises:
+            ConfigError: on samples of another form.
             DataError: if no item has a valid label or a box.
         """
+        for item in items:
+            if not isinstance(item, dict) or not item.keys() >= _KEYS:
+                given = sorted(item) if isinstance(item, dict) else type(item).__name__
+                raise ConfigError(
+                    f"a sample of the form {given}",
+                    f"a dict with {', '.join(sorted(_KEYS))}, as to_item makes it",
+                    "Give MixedScans(..., to_sample=..., collate=function), a function for "
+                    "samples of your form.",
+                )
         boxes = [item["boxes"] for item in items]
         batch = _FORMS[self.form](items, self.sensor) | {
             "boxes": torch.cat(boxes),

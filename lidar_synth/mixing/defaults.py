@@ -20,7 +20,8 @@ from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.compose import Compose
 from lidar_synth.labels.mix import PasteObjects
 from lidar_synth.labels.policies import Labels
-from lidar_synth.mixing.schedules import SyntheticFirst
+from lidar_synth.mixing.schedules import SyntheticFirst, check_epochs
+from lidar_synth.mixing.sources import each
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +67,12 @@ def augment_boxes(banks: Iterable[ObjectBank]) -> Compose:
 
 
 def quarter_of(epochs: int) -> dict[int, float]:
-    """The schedule of synthetic scans alone in a quarter of the epochs, then real scans alone."""
+    """The schedule of synthetic scans alone in a quarter of the epochs, then real scans alone.
+
+    Raises:
+        ConfigError: on fewer than 4 epochs.
+    """
+    check_epochs(epochs)
     return {0: 1.0, epochs // 4: 0.0}
 
 
@@ -125,6 +131,13 @@ def detection_options(real: Any, epochs: Any) -> dict[str, Any]:
             "real scans with boxes, and epochs",
             "mix(real, synth, task='detection', epochs=40)",
         )
+    for source, _ in each(real):
+        if getattr(source, "beyond_view", False):  # KITTI's object set
+            log.warning(
+                f"{source.root} has points all around and boxes in the camera's view only: a "
+                "detector would learn that objects elsewhere are background. Take "
+                f"open_scans({str(source.root)!r}).with_boxes()"
+            )
     return {
         "ratio": SyntheticFirst(epochs),
         "labels": "boxes",

@@ -108,9 +108,20 @@ class ByDomain(nn.Module):
         self.domain: Tensor | None = None
 
     def forward(self, x: Tensor) -> Tensor:
-        """The output (B, ...) of each sample (B, ...) by the layer of its domain."""
+        """The output (B, ...) of each sample (B, ...) by the layer of its domain.
+
+        Raises:
+            ConfigError: on another number of samples than of domains.
+        """
         if self.domain is None:
             return self.layers[0](x)  # type: ignore[no-any-return]
+        if len(self.domain) != len(x):
+            raise ConfigError(
+                f"{len(self.domain)} domains for {len(x)} rows",
+                "a domain for each row",
+                "For concatenated points: "
+                'batch["domain"].repeat_interleave(batch["offsets"].diff()).',
+            )
         of = [torch.nonzero(self.domain == number)[:, 0] for number in (0, 1)]
         parts = [
             layer(x[indices])

@@ -63,8 +63,15 @@ def shared_integers(*values: int) -> Tensor:
     which they started.
     """
     tensor = torch.tensor(values, dtype=torch.int64)
-    tensor.share_memory_()  # type: ignore[no-untyped-call]
+    share(tensor)
     return tensor
+
+
+def share(tensor: Tensor) -> None:
+    """Move a tensor to shared memory, where that of a deep copy or of a pickle is not; one that was
+    sent to a spawned worker stays the main process's."""
+    if not tensor.is_shared():  # type: ignore[no-untyped-call]
+        tensor.share_memory_()  # type: ignore[no-untyped-call]
 
 
 class CurrentEpoch:
@@ -189,6 +196,8 @@ class CurrentEpoch:
             "_passes": WeakKeyDictionary(),
             "_followers": WeakSet(),
         }
+        share(self._shared)
+        share(self._fetched)
 
 
 def check_pass(begun: int, epoch: int) -> None:

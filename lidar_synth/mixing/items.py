@@ -59,7 +59,8 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
         label = np.full(len(scan), IGNORE, np.int64)
     else:
         label = scan.label.astype(np.int64)
-        wrong = (scan.label >= len(NAMES)) & (scan.label != IGNORE)
+        valid = (scan.label >= 0) & (scan.label < len(NAMES))
+        wrong = ~valid & (scan.label != IGNORE)
         if wrong.any():
             raise DataError(
                 f"scan {scan.id!r}: labels {np.unique(label[wrong])[:8].tolist()}",

@@ -5,7 +5,7 @@ from typing import Any
 
 from torch.utils.data import DataLoader
 
-from lidar_synth.mixing.batches import MixedBatches
+from lidar_synth.mixing.batches import MixedBatches, cut_steps
 
 
 class MixedLoader(DataLoader[Any]):
@@ -54,6 +54,20 @@ class MixedLoader(DataLoader[Any]):
         """Set the epoch of the next pass; raises as ``MixedScans.set_epoch``."""
         self._mixed.set_epoch(epoch)
         self._pass = (epoch, 0)
+
+    def __len__(self) -> int:
+        """Number of batches in a complete epoch, also while one is resumed: trainers ask for it
+        once, and Lightning adds the batches before a checkpoint to its count."""
+        batches = self._batches
+        return len(
+            cut_steps(
+                0,
+                len(self._mixed),
+                batches.batch_size,
+                batches.world_size,
+                batches.drop_last,
+            )
+        )
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
         epoch = self.epoch

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidar_synth.geometry.scan import POINT_FIELDS, REAL, Scan
+from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.labels.own import KeepBoxes, RemoveLabels
 from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
@@ -66,12 +66,12 @@ class SampleMaker:
 
     def real(self, scan: Scan, rng: np.random.Generator) -> Any:
         """The sample of a real scan."""
-        if scan.domain != REAL:  # scans of the town, for instance, count as real here
-            scan = replace(scan, domain=REAL)
         self._notices.real(scan)
-        scan = copy_scan(scan)  # a source may keep its scans in memory
+        # Copied, as a source may keep its scans in memory. Scans of the town count as real here.
+        scan = replace(copy_scan(scan), domain=REAL)
         if self._augment is not None and self._augment_real:
-            scan = self._augment(scan, rng)
+            # A scan with pasted objects is synthetic elsewhere.
+            scan = replace(self._augment(scan, rng), domain=REAL)
         return self._to_sample(scan, rng)
 
     def synthetic(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
@@ -86,7 +86,8 @@ class SampleMaker:
             scan = self._without_unboxed(scan)
         if self._augment is not None:
             scan = self._augment(scan, rng)
-        return self._to_sample(scan, rng)
+        # A policy or an augmentation of the user's may make a new scan, which is real by default.
+        return self._to_sample(replace(scan, domain=SYNTHETIC), rng)
 
 
 def make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":

@@ -1,7 +1,7 @@
 """Messages about what would harm a training without an error; each is logged once per dataset.
 
-Objects without boxes, unlabelled real scans, numbers of points that tell real from synthetic, a
-bank used very often.
+Objects without boxes, unlabelled real scans, reflectances or numbers of points that tell real from
+synthetic, a bank used very often.
 """
 
 import logging
@@ -36,7 +36,7 @@ def report_repeats(plan: MixingPlan) -> None:
                 source.length,
                 source.identity[:40],
                 count / source.length,
-                count // OFTEN,
+                count,
             )
 
 
@@ -49,7 +49,7 @@ class Notices:
     """
 
     def __init__(self, images: bool = False, boxes: bool = False) -> None:
-        self._real_boxes = self._told = False
+        self._real_boxes = self._told = self._scale_told = False
         # a real scan without labels; "" if that is no matter, or told
         self._unlabelled: str | None = "" if boxes else None
         self._labelled = False  # whether a synthetic scan had labels
@@ -58,7 +58,16 @@ class Notices:
         self._sizes: tuple[list[int], list[int]] = ([], [])
 
     def real(self, scan: Scan) -> None:
-        """Note whether real scans have boxes and labels, and their numbers of points."""
+        """Report a reflectance above 1; note whether real scans have boxes and labels, and their
+        numbers of points."""
+        if not self._scale_told and (scan.reflectance > 1).any():
+            self._scale_told = True
+            self._warn(
+                "real scan %r has reflectances up to %g, synthetic ones up to 1: the scale tells "
+                "them apart. Divide them where the Scan is made, intensities of 0 to 255 by 255.",
+                scan.id,
+                scan.reflectance.max(),
+            )
         self._real_boxes |= scan.boxes is not None
         if self._unlabelled is None and (
             scan.label is None or not (scan.label != IGNORE).any()

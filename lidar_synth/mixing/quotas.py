@@ -116,7 +116,8 @@ class Mixture:
                 "no weights, or another epoch_size",
                 "Use epoch_size='replace' or a number of samples.",
             )
-        count_samples(self, 0)
+        for epoch in (0, *self._deciding):
+            exact_synthetic(self, epoch)  # raises if the sources cannot serve it
 
     @property
     def real_length(self) -> int:
@@ -172,8 +173,8 @@ class Mixture:
 
     @cached_property
     def _deciding(self) -> tuple[int, ...]:
-        """The epochs that determine lengths: all until the schedule settles, the first hundred if
-        it never does."""
+        """The epochs that are checked and that determine lengths: all until the schedule settles,
+        the first hundred if it never does."""
         last = settled(self.ratio)
         epochs = [
             *range(_FIRST_EPOCHS if last is None else min(last, _FIRST_EPOCHS)),
@@ -210,7 +211,7 @@ def exact_synthetic(mixture: Mixture, epoch: int) -> Fraction:
         )
     if not mixture.real_length and (share < 1 or not isinstance(size, int)):
         raise DataError(
-            f"no real scans, with ratio {float(share):g} and epoch_size={size!r}",
+            f"no real scans, with ratio {float(share):g} in epoch {epoch} and epoch_size={size!r}",
             "a real source with scans",
             "For synthetic scans only, use ratio=1 and set epoch_size to the number of samples.",
         )

@@ -1,14 +1,19 @@
 """``MixedScans``: real and synthetic scans in one map-style dataset."""
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakValueDictionary
 
 import numpy as np
-from torch.utils.data import Dataset, default_collate, get_worker_info
+from torch.utils.data import (
+    Dataset,
+    IterableDataset,
+    default_collate,
+    get_worker_info,
+)
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, identity_of
@@ -19,7 +24,7 @@ from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
 from lidar_synth.mixing.domains import make_weight
 from lidar_synth.mixing.epochs import CurrentEpoch, Position
-from lidar_synth.mixing.items import Item, to_item
+from lidar_synth.mixing.items import to_item
 from lidar_synth.mixing.loader import MixedLoader
 from lidar_synth.mixing.making import SampleMaker, ToSample, make_transfer
 from lidar_synth.mixing.notices import report_repeats
@@ -31,7 +36,7 @@ from lidar_synth.mixing.schedules import (
     share_of,
     to_integer,
 )
-from lidar_synth.mixing.sources import check_together, each, loss_weights_of
+from lidar_synth.mixing.sources import check_together, each, loss_weights_of, sensor_of
 from lidar_synth.mixing.synthetic import make_synthetic
 from lidar_synth.noise import keyed_rng
 
@@ -61,9 +66,9 @@ class MixedScans(Dataset[Any]):
     Args:
         real: indexable source of ``Scan``, or ``Sources`` of several; None with ratio 1.
         synth: a generator, a bank, a rolling bank, scans by index, or ``Sources`` of several.
-        ratio: share of synthetic samples in [0, 1]: a number, a list with one for each epoch,
-            ``{epoch: share}``, ``Linear(first, last, epochs)``, ``SyntheticFirst(epochs)`` or a
-            function of the epoch.
+        ratio: share of synthetic samples in [0, 1]: a number, a list or array with one for each
+            epoch, ``{epoch: share}``, ``Linear(first, last, epochs)``, ``SyntheticFirst(epochs)``
+            or a function of the epoch.
         labels: label policy of the synthetic scans: a policy of ``lidar_synth.labels`` such as
             ``PasteObjects(bank, count=8)``, a name of ``lidar_synth.labels.POLICIES``, ``{name:
             {argument: value}}``, or your own ``(scan, rng) -> scan``.
@@ -86,7 +91,8 @@ class MixedScans(Dataset[Any]):
         augment_real: whether to apply ``augment`` to real scans too; otherwise they stay unchanged,
             bit for bit.
         to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py).
-            The scan is a copy, which it and the trainer may change in place.
+            The scan is a copy, which it and the trainer may change in place. Into a dict with the
+            key ``loss_weight`` the weight of the plan is written.
         collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"``
             (collate.py), or your own function.
         unlabelled: ``"error"`` refuses a batch without any valid label; ``"allow"`` returns it,
@@ -227,9 +233,10 @@ class MixedScans(Dataset[Any]):
         cls,
         dataset: Any,
         synth: Any,
-        ratio: Ratio = 0.25,
+        ratio: Ratio | None = None,
         *,
         to_sample: ToSample,
+        epochs: int | None = None,
         collate: Callable[[Any], Any] = default_collate,
         **options: Any,
     ) -> "MixedScans":
@@ -242,6 +249,7 @@ class MixedScans(Dataset[Any]):
         Args:
             dataset: has ``__len__`` and ``__getitem__``; or ``Sources`` of several.
             synth, ratio: as for ``MixedScans``.
+            epochs: of a segmenter's training, in the place of ``ratio``: the recipe of ``mix``.
             to_sample: ``(scan, rng) -> sample`` gives a synthetic scan the form of ``dataset``'s
                 samples.
             collate: the trainer's own collate function.
@@ -264,14 +272,21 @@ class MixedScans(Dataset[Any]):
             >>> [train[i].shape[1] for i in range(len(train))]
             [3, 3, 3, 3]
         """
+        own: dict[str, Any] = {"ratio": 0.25 if ratio is None else ratio}
+        if epochs is not None and ratio is None:
+            # It imports all that pastes objects.
+            from lidar_synth.mixing.defaults import segmentation_options
+
+            count = sum(len(source) for source, _ in each(dataset))
+            alike = _same_lasers(synth, options.get("as_sensor"))
+            own = segmentation_options(count, epochs, alike)
         return cls(
             dataset,
             synth,
-            ratio,
             to_sample=to_sample,
             collate=collate,
             real_as_is=True,
-            **options,
+            **(own | options),
         )
 
     def __getattr__(self, name: str) -> Any:
@@ -427,8 +442,8 @@ class MixedScans(Dataset[Any]):
         return weight * float(share_of(self.synthetic_weight, plan.epoch))
 
     def _weighed(self, sample: Any, plan: MixingPlan, position: int) -> Any:
-        """The sample, with its weight if it is a plain item."""
-        if isinstance(sample, Item):
+        """The sample, with its weight if it is a plain item or a dict with the item's values."""
+        if isinstance(sample, dict) and "loss_weight" in sample:
             sample["loss_weight"] = self._weight_of(plan, position)
         return sample
 
@@ -516,18 +531,32 @@ class MixedScans(Dataset[Any]):
 
 
 def _check_lengths(reals: Iterable[tuple[Any, float | None]]) -> None:
-    """Refuse real sources without a length.
+    """Refuse real sources without a length, or by iteration only.
 
     Raises:
         ConfigError: on one.
     """
     for source, _ in reals:
+        if isinstance(source, IterableDataset | Iterator):
+            raise ConfigError(
+                f"real={type(source).__name__}, which only gives samples in turn",
+                "a map-style dataset, with __len__ and __getitem__",
+                "The order of a mixture takes samples by their numbers.",
+            )
         if not hasattr(source, "__len__"):
             raise ConfigError(
                 f"real={type(source).__name__}, which has no length",
                 "real scans first, then what synthetic ones come from",
                 "MixedScans(real, synth, ratio)",
             )
+
+
+def _same_lasers(synth: Any, as_sensor: Any) -> bool:
+    """Whether synthetic scans keep their lasers as scans of another sensor."""
+    transfer = make_transfer(as_sensor)
+    return transfer is None or all(
+        transfer.target.same_lasers(sensor_of(source)) for source, _ in each(synth)
+    )
 
 
 def _plan_synthetic(

@@ -127,8 +127,7 @@ class SyntheticFirst:
 
     def __post_init__(self) -> None:
         _checked(self.share, 0)
-        if to_integer(self.epochs, "epochs") < 4:
-            raise ConfigError(f"{self.epochs} epochs of a schedule", "at least 4")
+        check_epochs(self.epochs)
 
     @property
     def constant_from(self) -> int:
@@ -151,8 +150,8 @@ def make_schedule(
     """Make a schedule from a user's argument.
 
     Args:
-        ratio: one share for all epochs; a list with one for each; ``{epoch: share}``, each from its
-            epoch on; ``Linear(first, last, epochs)``; ``SyntheticFirst(epochs)``, in YAML
+        ratio: one share for all epochs; a list or array with one for each; ``{epoch: share}``, each
+            from its epoch on; ``Linear(first, last, epochs)``; ``SyntheticFirst(epochs)``, in YAML
             ``{synthetic_first: epochs}``; or any function of the epoch.
 
     Raises:
@@ -161,6 +160,8 @@ def make_schedule(
     if callable(ratio):
         return ratio
     named: Any = ratio
+    if hasattr(named, "tolist"):  # an array of numpy or torch
+        return make_schedule(named.tolist())
     if isinstance(named, Mapping) and len(named) == 1:
         [(name, epochs)] = named.items()
         if name in BY_NAME:
@@ -208,6 +209,16 @@ def to_integer(value: Any, name: str) -> int:
         "an integer",
         "Write it without quotes or decimals.",
     )
+
+
+def check_epochs(epochs: int) -> None:
+    """Refuse a training too short for a schedule in quarters.
+
+    Raises:
+        ConfigError: on fewer than 4 epochs.
+    """
+    if to_integer(epochs, "epochs") < 4:
+        raise ConfigError(f"{epochs} epochs of a schedule", "at least 4")
 
 
 def settled(schedule: Schedule) -> int | None:

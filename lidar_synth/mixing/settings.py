@@ -30,6 +30,7 @@ further keys."""
 TASKS = ("segmentation", "detection")
 OPTIONS = (
     "synthetic",
+    "epochs",
     "ratio",
     "loss_weight",
     "labels",
@@ -208,7 +209,8 @@ def mix_for_trainer(
 
     Args:
         real: number of the trainer's real samples.
-        settings: keys of ``OPTIONS``; ``synthetic`` is required.
+        settings: keys of ``OPTIONS``; ``synthetic`` is required. ``epochs`` are those of the
+            trainer, and take the place of ``ratio``, see ``MixedScans.wrap``.
         to_sample: ``(scan, rng) -> sample`` for synthetic scans.
         weighs: whether the trainer multiplies losses by ``loss_weight``.
 

@@ -49,7 +49,9 @@ class Sources:
                 )
         self.loss_weights = tuple(
             check_share("loss weight", weight)
-            for weight in loss_weights or [1.0] * len(sources)
+            for weight in (
+                [1.0] * len(sources) if loss_weights is None else loss_weights
+            )
         )
         self.sources = sources
         plain = (

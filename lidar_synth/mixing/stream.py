@@ -9,7 +9,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.batches import AHEAD, CutSteps, cut_steps, go_to, rank_share
-from lidar_synth.mixing.epochs import check_pass, shared_integers
+from lidar_synth.mixing.epochs import check_pass, share, shared_integers
 from lidar_synth.mixing.scans import MixedScans
 from lidar_synth.mixing.state import (
     Divided,
@@ -250,6 +250,10 @@ class MixedStream(Divided, IterableDataset[Any]):
     def __getstate__(self) -> dict[str, Any]:
         self._check()  # here, because spawned workers do not see the Accelerator
         return self.__dict__
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ |= state
+        share(self._start)
 
     def _steps(self, start: int, end: int) -> CutSteps:
         # The loader's batches have a fixed size, so the remainder cannot be added to the last

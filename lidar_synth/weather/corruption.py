@@ -4,7 +4,7 @@ A corruption says which point of the given scan each of its points comes from, a
 is where it is. A point keeps the label, ring and time of the point that its ray had.
 Where the ray met no surface but a drop, a flake or another sensor's pulse, the label is
 255 = ignore. Boxes stay; one that held returns and holds none any more gets the
-occlusion 3 (unknown), by which a loader can leave it out.
+occlusion 3 (unknown). ``Compose`` drops it.
 """
 
 from abc import ABC, abstractmethod

@@ -72,7 +72,7 @@ class Spray(SignalLoss):
             soft[rays[nearer]] = seen[nearer]
             place[rays[nearer]] = where[nearer]
             left[rays] *= np.exp(-2 * self.extinction * depth)
-        return self.strongest(scan, distance, left, soft, place)
+        return self.strongest(scan, distance, left, soft, place, rng)
 
 
 def place_plumes(scan: Scan) -> NDArray[np.float32]:
@@ -162,7 +162,7 @@ class Dirt(SignalLoss):
         cell += column.astype(np.int32).clip(0, columns - 1)
         # The pulse passes twice.
         left = np.exp(-2 * thickness.ravel()[cell])
-        return self.attenuate(scan, distance, left)
+        return self.attenuate(scan, distance, left, rng)
 
 
 def draw_dirt(share: float, rng: np.random.Generator) -> Values:

@@ -76,7 +76,8 @@ class Fog(SignalLoss):
         noise = rng.standard_normal((2, len(scan)), np.float32)
         soft = strength[index] * np.exp(UNEVEN * noise[0])
         place = peak[index] + np.float32(LIGHT * WIDTH / 8) * np.abs(noise[1])
-        return self.strongest(scan, distance, left, soft, np.minimum(place, distance))
+        place = np.minimum(place, distance)
+        return self.strongest(scan, distance, left, soft, place, rng)
 
 
 @lru_cache(maxsize=16)

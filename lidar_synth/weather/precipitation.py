@@ -86,7 +86,7 @@ class Precipitation(SignalLoss):
         in_front = place < distance
         # The strongest particle is in the way of the rest of the pulse, too.
         left = np.exp(loss * distance) * (1 - filled * in_front)
-        return self.strongest(scan, distance, left, soft * in_front, place)
+        return self.strongest(scan, distance, left, soft * in_front, place, rng)
 
     def draw_particles(
         self, count: int, rng: np.random.Generator

@@ -238,7 +238,7 @@ class LowPower(SignalLoss):
         require_between("power", self.power, 1e-3, 1)
 
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
-        return self.attenuate(scan, ranges_of(scan), self.power)
+        return self.attenuate(scan, ranges_of(scan), self.power, rng)
 
 
 def _number_along(

@@ -37,11 +37,17 @@ def ranges_of(scan: Scan) -> Values:
     return np.asarray(np.maximum(distance, 0.1), np.float32)
 
 
-def signal_of(scan: Scan, distance: Values) -> Values:
-    """(N,) signals in clear air, at least ``FLOOR``: what was recorded was strong
-    enough."""
+def signal_of(scan: Scan, distance: Values, rng: np.random.Generator) -> Values:
+    """(N,) signals in clear air, at least ``FLOOR``: what was recorded was strong enough.
+
+    The reported reflectances put many far returns below it. How far above it these were
+    is not known: so each signal is at least that of an excess drawn from an exponential
+    distribution of mean ``FLOOR``, about that of the far returns above it. The lighter
+    the weather, the fewer it removes.
+    """
     bright = np.maximum(scan.reflectance, np.float32(DARKEST))
-    signal: Values = np.maximum(bright / (distance * distance), np.float32(FLOOR))
+    excess = rng.standard_exponential(len(scan), np.float32)
+    signal: Values = np.maximum(bright / (distance * distance), FLOOR * (1 + excess))
     return signal
 
 
@@ -64,15 +70,27 @@ class SignalLoss(Corruption):
 
     compensated: float = field(default=0.7, kw_only=True)
 
-    def attenuate(self, scan: Scan, distance: Values, left: Values | float) -> Change:
+    def attenuate(
+        self,
+        scan: Scan,
+        distance: Values,
+        left: Values | float,
+        rng: np.random.Generator,
+    ) -> Change:
         """What is left of a scan of N points if surfaces return the shares ``left``, (N,)
         in [0, 1], of their signals."""
         nothing = np.zeros(len(scan), np.float32)
         whole = np.broadcast_to(np.float32(left), len(scan))
-        return self.strongest(scan, distance, whole, nothing, nothing)
+        return self.strongest(scan, distance, whole, nothing, nothing, rng)
 
     def strongest(
-        self, scan: Scan, distance: Values, left: Values, soft: Values, place: Values
+        self,
+        scan: Scan,
+        distance: Values,
+        left: Values,
+        soft: Values,
+        place: Values,
+        rng: np.random.Generator,
     ) -> Change:
         """The stronger of two returns on each ray.
 
@@ -82,8 +100,9 @@ class SignalLoss(Corruption):
             left: (N,) share of the surface's signal that is left.
             soft: (N,) signal of particles, 1 / m^2.
             place: (N,) their distance, metres.
+            rng: for the signals that are not known, ``signal_of``.
         """
-        hard = signal_of(scan, distance) * left
+        hard = signal_of(scan, distance, rng) * left
         scattered = soft > hard
         change = keep_points(scan, np.maximum(soft, hard) >= FLOOR)
         source = change.source

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND
+from lidar_synth.datasets.classes import GROUND, has_ground
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.weather.corruption import Change, require_between
 from lidar_synth.weather.signal import SignalLoss, ranges_of
@@ -63,7 +63,7 @@ class WetGround(SignalLoss):
         passed = (1 - reflect_from_water(np.minimum(incidence, 1))) ** 2
         flat = min(self.depth / TEXTURE, 1.0)
         left[ground] = 1 - flat + flat * passed
-        return self.attenuate(scan, distance, left)
+        return self.attenuate(scan, distance, left, rng)
 
 
 def reflect_from_water(cosine: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -78,7 +78,7 @@ def reflect_from_water(cosine: NDArray[np.floating]) -> NDArray[np.floating]:
 def find_ground(scan: Scan) -> NDArray[np.bool_]:
     """(N,) whether points are of the ground: by their labels, or near the lowest return
     around them."""
-    if scan.label is not None:
+    if has_ground(scan.label):
         return np.asarray(GROUND[scan.label])
     height = scan.points[:, 2]
     column = np.clip(scan.points[:, :2] / CELL + SIDE / 2, 0, SIDE - 1).astype(np.int64)

@@ -7,7 +7,7 @@ The places are split in two halves; frames of each half are trained on and the o
 tested, so that two trainings of an arm test every place. Prints the mean gain and its interval,
 and adds the scores by place to OUT/scores.json. ``--polar`` takes polar_network.py instead of the
 range-view segmenter, ``--arm`` others of ``lidar-synth prove``. Call it with other ``--labelled``
-and ``--synthetic`` for the curves in OUT/gain.png.
+for the curves in OUT/gain.png.
 """
 
 import json
@@ -25,10 +25,6 @@ from lidar_synth.lab.proof import Trainer, reference
 from lidar_synth.lab.proof.arms import ARMS
 from lidar_synth.lab.proof.scores import interval
 
-AXES = {"labelled": "labelled frames", "synthetic": "generated scans"}
-"""Settings with a curve, and what they count."""
-BASE = {"labelled": 4, "synthetic": 192}
-"""The point in which the curves meet."""
 ARM = ["pretrain-generator"]
 
 
@@ -77,33 +73,32 @@ def compare(
 
 
 def draw(records: Sequence[dict[str, Any]], base: dict[str, Any], path: Path) -> None:
-    """Curves of the mean over the places: each by one setting, the others as in ``base``."""
-    figure, panels = plt.subplots(
-        1, 2, figsize=(8, 3.4), layout="constrained", sharey=True
-    )
-    for axes, (name, title) in zip(panels, AXES.items(), strict=True):
-        fixed = {key: value for key, value in base.items() if key != name}
-        found: dict[int, dict[str, Any]] = {}
-        for record in records:
-            if fixed.items() <= record.items():
-                found.setdefault(record[name], {}).update(record["arms"])
-        plot(axes, found)
-        axes.set_xlabel(title)
-    panels[0].set(ylabel="mean IoU, %", ylim=(0, None))
-    lines = panels[0].get_legend_handles_labels()
-    figure.legend(*lines, loc="outside lower center", ncols=2)
+    """The mean over the places by number of labelled frames, otherwise as in ``base``."""
+    fixed = {key: value for key, value in base.items() if key != "labelled"}
+    found: dict[str, dict[int, float]] = {}
+    for record in records:
+        if fixed.items() <= record.items():
+            for arm, scores in record["arms"].items():
+                mean = float(np.mean([*scores.values()]))
+                found.setdefault(arm, {})[record["labelled"]] = mean
+    figure, axes = plt.subplots(figsize=(7, 3.4), layout="constrained")
+    plot(axes, found)
     figure.savefig(path)
 
 
-def plot(axes: Any, found: dict[int, Any]) -> None:
-    """A curve for each arm over the counts."""
-    for arm in ("pretrain-generator", "alone", "real"):
-        counts = sorted(count for count in found if arm in found[count])
-        means = [np.mean([*found[count][arm].values()]) for count in counts]
-        axes.plot(counts, means, "o-", label=ARMS[arm].title)
+def plot(axes: Any, found: dict[str, dict[int, float]]) -> None:
+    """Curves of two arms over the labelled frames; a line for the training without a label."""
+    for arm in ("pretrain-generator", "real"):
+        means = dict(sorted(found.get(arm, {}).items()))
+        axes.plot(means.keys(), means.values(), "o-", label=ARMS[arm].title)
+    for mean in found.get("alone", {}).values():
+        title = "generated scans alone, without a label"
+        axes.axhline(mean, color="C2", linestyle="--", label=title)
     axes.set_xscale("log")
-    axes.set_xticks(sorted(found), sorted(found))
+    axes.set_xticks([*found["real"]], found["real"])
     axes.minorticks_off()
+    axes.set(xlabel="labelled frames", ylabel="mean IoU, %", ylim=(0, None))
+    axes.legend(loc="lower right")
 
 
 def main(
@@ -147,7 +142,7 @@ def main(
     kept = json.loads(path.read_text()) if path.is_file() else []
     records = [*kept, setting | {"arms": scores}]
     path.write_text(json.dumps(records, indent=1) + "\n")
-    draw(records, setting | BASE, out / "gain.png")
+    draw(records, setting, out / "gain.png")
 
 
 if __name__ == "__main__":

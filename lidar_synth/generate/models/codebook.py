@@ -35,7 +35,7 @@ class Codebook(nn.Module):
     def __init__(self, count: int, channels: int, kind: str) -> None:
         super().__init__()
         self.codes = nn.Parameter(
-            torch.empty(count, channels), requires_grad=kind == "gradient"
+            torch.empty(count, channels), requires_grad=kind == "gradient" and count > 0
         )
         if count:
             nn.init.uniform_(self.codes, -1 / count, 1 / count)

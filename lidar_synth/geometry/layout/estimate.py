@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND, IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import GROUND, TRAIN_ID, has_ground
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.layout.layout import (
     CLASSES,
@@ -47,8 +47,8 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
 
     Args:
         scan: N points and boxes. Ground and outlines are those of its labels; a scan without labels
-            has the plane of its lowest returns, and outlines of what stands on it. Its boxes are
-            ``select_known_boxes``.
+            of the ground has the plane of its lowest returns, and outlines of what stands on it.
+            Its boxes are ``select_known_boxes``.
         reach: of the ground, metres; by default the sensor's range.
 
     Raises:
@@ -64,9 +64,7 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
         raise DataError(
             f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects"
         )
-    label = (
-        scan.label if scan.label is not None and (scan.label != IGNORE).any() else None
-    )
+    label = scan.label if has_ground(scan.label) else None
     ground = _plane(
         _lowest(scan.points) if label is None else scan.points[GROUND[label]], scan.id
     )

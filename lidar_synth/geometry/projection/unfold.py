@@ -6,7 +6,7 @@ where the lasers are closer together than the rows (the upper half of an HDL-64E
 empty where they are further apart.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,11 @@ the last ring, as the public code of R2Flow does (this shifts a scan whose lower
 off)."""
 
 
-def _rows_by_elevation(
-    elevations: NDArray[np.float64], beams: NDArray[np.float32]
+def rows_by_elevation(
+    elevations: NDArray[np.float64], beams: NDArray[np.floating[Any]]
 ) -> NDArray[np.int64]:
     """(R,) increasing rows of R rings that minimise the sum of distances between elevations and
-    beams, radians."""
+    beams, radians; at most as many rings as beams."""
     distance = np.abs(elevations[:, None] - beams[None].astype(np.float64))
     total = np.full((len(elevations) + 1, len(beams) + 1), np.inf)
     total[0] = 0
@@ -129,4 +129,4 @@ def _rows_of_rings(
     middle = np.empty(count)
     sines_of(scan.points, sine)
     medians(sine, bounds, middle)
-    return _rows_by_elevation(np.arcsin(middle), lasers.laser_elevations)
+    return rows_by_elevation(np.arcsin(middle), lasers.laser_elevations)

@@ -1,12 +1,14 @@
 """``lidar-synth curate``: scores the scans of a bank and drops unusual ones."""
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lidar_synth.cli.bank import BankFolder
+from lidar_synth.cli.options import local_path
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,7 +28,10 @@ def curate(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="folder of the curated bank; without it nothing is written"),
+        typer.Option(
+            help="folder of the curated bank; without it nothing is written",
+            parser=local_path,
+        ),
     ] = None,
     reference: Annotated[
         str | None,
@@ -47,7 +52,10 @@ def curate(
     limit: Annotated[int, typer.Option(min=0, help="number of scans to list")] = 10,
     plot: Annotated[
         Path | None,
-        typer.Option(help="PNG file to write with the distribution of every score"),
+        typer.Option(
+            help="PNG file to write with the distribution of every score",
+            parser=local_path,
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="number of worker processes")] = 1,
@@ -55,10 +63,10 @@ def curate(
     """Scores every scan of a bank, lists the most unusual ones, and writes a bank without those
     that match a rule.
 
-    Scores are saved in BANK/scores.npz, those of a bank at a URL in this folder; run it again to
-    resume an interrupted run. The curated bank
-    has its own index and links to the same shards. A rule joins conditions by "and"; each is a
-    score, one of < <= > >=, and a number. Run it without --out to see what a rule would drop.
+    Scores are saved in BANK/scores.npz, those of a read-only bank or one at a URL in this folder;
+    run it again to resume an interrupted run. The curated bank has its own index and links to the
+    same shards. A rule joins conditions by "and"; each is a score, one of < <= > >=, and a number.
+    Run it without --out to see what a rule would drop.
 
     \b
     Scores:
@@ -164,14 +172,13 @@ def _scores(
             [*source.ids, *(scan_hash(source[i]) for i in (0, len(source) // 2, -1))]
         )
         name = f"{len(source)} scans of {' '.join(filter(None, (reference, split)))} ({which[:8]})"
-    path = Path(bank) / FILE
-    if is_url(bank):
-        path = Path(f"scores-{opened.identity[:12]}.npz")
-    if path.is_file():
-        saved = read_scores(path)
+    elsewhere = is_url(bank) or not os.access(bank, os.W_OK)
+    places = (Path(bank) / FILE, Path(f"scores-{opened.identity[:12]}.npz"))
+    for saved in (read_scores(place) for place in places if place.is_file()):
         if (saved.bank, saved.reference) == (opened.identity, name):
             return saved
-    keep = TemporaryDirectory() if is_url(bank) else keep_features_in(Path(bank))
+    path = places[elsewhere]
+    keep = TemporaryDirectory() if elsewhere else keep_features_in(Path(bank))
     with keep as place:
         folder = Path(place)
         scores = score(

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lidar_synth.cli.options import local_path
+
 if TYPE_CHECKING:
     from lidar_synth.lab.kitti360.report import LabelReport
 
@@ -19,7 +21,10 @@ def label(
         ),
     ],
     out: Annotated[
-        Path, typer.Argument(metavar="OUT", help="folder to write to; may be ROOT")
+        Path,
+        typer.Argument(
+            metavar="OUT", help="folder to write to; may be ROOT", parser=local_path
+        ),
     ],
     split: Annotated[
         str, typer.Option(help="drives to label, for instance r2flow/train")

@@ -121,8 +121,7 @@ def prove(
       lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain \\
           --ratio 0.25 --ratio 0.5 --dry-run
     """
-    import os
-
+    from lidar_synth.files.processes import usable_cores
     from lidar_synth.formats import open_scans
     from lidar_synth.lab.proof import CommandTrainer, ProofSettings, reference
     from lidar_synth.lab.proof import prove as run
@@ -168,7 +167,7 @@ def prove(
     source = open_scans(root, sensor=sensor, split=split)
     others = open_scans(tests, sensor=sensor) if tests else None
     if dry_run:
-        jobs = jobs or os.cpu_count() or 1
+        jobs = jobs or usable_cores()
         plan, _ = make_plan(
             source, settings, minutes, jobs, tests=others, device=device
         )
@@ -211,12 +210,17 @@ def _prove_detection(
 ) -> None:
     from lidar_synth.lab.proof.detection import DetectionSettings, prove_detection
     from lidar_synth.lab.proof.detection.page import format_table
-    from lidar_synth.lab.proof.detection.study import DetectionWork, describe
+    from lidar_synth.lab.proof.detection.study import (
+        DetectionWork,
+        describe,
+        with_boxes,
+    )
 
     given = {name: value for name, value in options.items() if value}
     settings = DetectionSettings(**given)
     if dry_run:
-        typer.echo(describe(DetectionWork(source, settings, out, pools or out)))
+        work = DetectionWork(with_boxes(source), settings, out, pools or out)
+        typer.echo(describe(work))
         return
     values = prove_detection(
         source,

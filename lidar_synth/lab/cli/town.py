@@ -1,13 +1,14 @@
 """``lidar-synth town``: scans of procedural streets in the folder layouts of public datasets."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from lidar_synth.cli.options import Out
+
 
 def town(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
+    out: Out,
     scans: Annotated[int, typer.Option(help="number of scans")] = 200,
     seed: Annotated[
         int, typer.Option(help="seed of the town: another seed is another town")

@@ -118,7 +118,7 @@ def distill(
     \b
     Examples:
       lidar-synth distill town_student
-      lidar-synth distill town_student strategy=uniform_piecewise output=runs/uniform
+      lidar-synth distill town_student strategy=uniform_piecewise also=[] output=runs/uniform
       lidar-synth distill town_student weaker=null guidance=1 output=runs/plain
       lidar-synth distill kitti360_student teacher=mine.safetensors grid=[1,0.86,0.58,0.22,0]
     """

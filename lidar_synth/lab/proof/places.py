@@ -5,6 +5,7 @@ neighbouring frames show one street. Scans of one place are therefore all traine
 on.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from itertools import product
 
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Source
 
+log = logging.getLogger(__name__)
+
 APART = 50.0
 """Metres: scans nearer than this are of one place; a sensor sees about as far."""
 STRETCHES = 3
@@ -21,15 +24,19 @@ LEFT_OUT = 0.25
 """Share of the scans of a drive that are left out between its stretches."""
 MOST_POSES = 2000
 
+_SHUFFLED = "KITTI's frames are shuffled: put mapping/ of the devkit beside training/."
+
 Places = dict[str, list[int]]
 """{name of the place: indices of its scans in the source}."""
 
 
 def by_drive(source: Source, names: Sequence[str]) -> Places:
-    """A place for each drive (sequence): what the names of scans have before the frame."""
+    """A place for each drive (sequence): the source's ``drives``, or what the names of scans have
+    before the frame."""
+    folders = [name.rpartition("/")[0] or "all scans" for name in names]
     places: Places = {}
-    for index, name in enumerate(names):
-        places.setdefault(name.rpartition("/")[0] or "all scans", []).append(index)
+    for index, drive in enumerate(getattr(source, "drives", None) or folders):
+        places.setdefault(drive, []).append(index)
     return places
 
 
@@ -58,7 +65,11 @@ def by_pose(source: Source, names: Sequence[str]) -> Places:
 
 def by_stretch(source: Source, names: Sequence[str], count: int = STRETCHES) -> Places:
     """Equal stretches of each drive in the order of its frames; a share of ``LEFT_OUT`` between
-    them is left out."""
+    them is left out. Warns of KITTI's object set, whose frames are shuffled."""
+    if is_shuffled(source):
+        log.warning(
+            f"stretches show each other's streets, so that a comparison is too good. {_SHUFFLED}"
+        )
     places: Places = {}
     for drive, indices in by_drive(source, names).items():
         gap = LEFT_OUT * len(indices) / (count - 1)
@@ -113,10 +124,17 @@ def find_places(source: Source, by: str = "auto", fewest: int = 2) -> Places:
             f"{len(source)} scans of one place ({next(iter(places))})",
             "scans of at least two places, better of five or more: networks are tested on places "
             "that they have not seen",
-            "Add drives or sequences. If a single drive is all there is, split it: --places "
+            _SHUFFLED
+            if is_shuffled(source)
+            else "Add drives or sequences. If a single drive is all there is, split it: --places "
             "stretch (places='stretch').",
         )
     return dict(sorted(places.items()))
+
+
+def is_shuffled(source: Source) -> bool:
+    """Whether neither the names of scans nor their order tell drives apart."""
+    return getattr(source, "drives", ()) is None
 
 
 def names_of(source: Source) -> list[str]:

@@ -2,7 +2,6 @@
 out."""
 
 import json
-import os
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +20,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_sealed, seal
-from lidar_synth.files.processes import map_in_processes
+from lidar_synth.files.processes import map_in_processes, usable_cores
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.evaluate.leakage import refuse_leaks
@@ -216,7 +215,7 @@ def prove(
     source = open_scans(scans) if isinstance(scans, str | Path) else scans
     if isinstance(tests, str | Path):
         tests = open_scans(tests)
-    jobs = jobs or os.cpu_count() or 1
+    jobs = jobs or usable_cores()
     plan, loaded = make_plan(
         source, settings or ProofSettings(), minutes, jobs, _earlier(out), tests, device
     )

@@ -15,7 +15,7 @@ from lidar_synth.geometry.agreement import agreement
 from lidar_synth.geometry.overlap import count_overlapping
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.fitting import SensorFit, fit_sensor
-from lidar_synth.lab.proof.places import by_drive, names_of
+from lidar_synth.lab.proof.places import by_drive, is_shuffled, names_of
 from lidar_synth.lab.spread import spread
 
 LOOKED = 8
@@ -61,10 +61,19 @@ class Findings:
         """The first of ``tasks``, or "unlabelled"."""
         return next(iter(self.tasks), "unlabelled")
 
+    @property
+    def drives(self) -> int:
+        """Number of drives; 0 if the frames do not tell."""
+        if is_shuffled(self.source):
+            return 0
+        return len(by_drive(self.source, names_of(self.source)))
+
     def lines(self) -> list[str]:
         """Scans, labels, boxes and sensor in a line each."""
         source = self.source
-        drives = len(by_drive(source, names_of(source)))
+        drives = (
+            "one drive" if self.drives == 1 else f"{self.drives or 'unknown'} drives"
+        )
         few = ", ".join(self.classes[:5])
         more = ", ..." if len(self.classes) > 5 else ""
         labels = f"{len(self.classes)} classes ({few}{more})" if few else "none"
@@ -73,8 +82,7 @@ class Findings:
             boxes += f"; {self.overlapping} overlap one of their class"
         doubts = " ".join(self.fit.uncertain) if self.fit else ""
         return [
-            f"scans    {len(source)} of layout {self.layout} in {drives} "
-            f"{'drive' if drives == 1 else 'drives'}: {source.root}",
+            f"scans    {len(source)} of layout {self.layout} in {drives}: {source.root}",
             f"labels   {labels}, in {self.labelled} of {self.looked} scans looked at",
             f"boxes    {boxes or 'none'}",
             f"sensor   {source.sensor.grid_text()}, {self.known}. {doubts}".rstrip(

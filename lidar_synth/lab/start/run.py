@@ -1,9 +1,8 @@
 """``start``: look at the scans, make synthetic ones, compare, and write down how to train."""
 
-import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,8 @@ from lidar_synth.bake.estimate import estimate
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.claims import claim, hold_writing
 from lidar_synth.files.disk import write_file
+from lidar_synth.files.processes import usable_cores
+from lidar_synth.formats import KITTIObject
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model
 from lidar_synth.geometry.sensor import Sensor, presets, sensor_yaml
@@ -115,23 +116,19 @@ class StartPlan:
         decided = ends_on_real(len(self.found.source), alike)
         if self.task == "segmentation" and decided:
             return True
-        return self.task != "unlabelled" and _places(self) == "stretch"
+        one = self.found.drives == 1 and _places(self) == "stretch"
+        return self.task != "unlabelled" and one
 
     def settings(self) -> dict[str, Any]:
         """The mixture, as trainers read it."""
-        if self.task == "unlabelled":
-            settings: dict[str, Any] = {
-                "ratio": 1.0,
-                "labels": "generated",
-                "epoch_size": "replace",
-            }
-        else:
+        settings: dict[str, Any] = {"ratio": 1.0, "labels": "generated"}
+        settings["epoch_size"] = "replace"
+        first = self.task == "segmentation" and not self.ends_on_real
+        if self.task == "detection" or first:
             settings = dict(DEFAULTS[self.task])
         if self.ends_on_real:
             settings["ratio"] = quarter_of(EPOCHS)
-            if self.task == "segmentation":
-                settings["labels"] = "generated"
-        if len(self.found.source) < LEAST:
+        if "epoch_size" in settings and len(self.found.source) < LEAST:
             settings["epoch_size"] = LEAST
         settings = {"synthetic": str(self.synthetic), **settings, "seed": 0}
         sensor = self.found.source.sensor
@@ -243,7 +240,9 @@ def start(
         raise ConfigError(f"--out {out} inside of {root}", "a folder outside of it")
     found = look(root, sensor, out / SENSOR, reading)
     task = _task(found, task)
-    plan = _plan(found, task, out, scans, minutes, jobs or os.cpu_count() or 1)
+    if task == "detection" and isinstance(found.source, KITTIObject):
+        found = replace(found, source=found.source.with_boxes())
+    plan = _plan(found, task, out, scans, minutes, jobs or usable_cores())
     if trainer is not None:
         _configure(plan, trainer)  # complains before anything is made
     lines = (*found.lines(), plan.line())
@@ -442,11 +441,14 @@ def _code(plan: StartPlan) -> str:
     if plan.ends_on_real or unlabelled:
         settings = plan.settings()
         given += f", ratio={settings['ratio']}, epoch_size={settings['epoch_size']!r}"
-    if plan.task == "detection":
+    detection = plan.task == "detection"
+    target = "boxes" if detection else "label"
+    cropped = detection and isinstance(plan.found.source, KITTIObject)
+    boxed = ".with_boxes()" if cropped else ""
+    if detection:
         given += ', task="detection"'
-    target = "boxes" if plan.task == "detection" else "label"
     return f"""import lidar_synth
-real = lidar_synth.open_scans({str(plan.found.source.root)!r}{_options(plan)})
+real = lidar_synth.open_scans({str(plan.found.source.root)!r}{_options(plan)}){boxed}
 train = lidar_synth.mix(real, {str(plan.synthetic)!r}, {given})
 loader = train.loader(batch_size=4)
 for epoch in range({EPOCHS}):

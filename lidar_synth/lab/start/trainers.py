@@ -14,7 +14,6 @@ import yaml
 
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.files.disk import write_file
-from lidar_synth.mixing.defaults import TOWN_OBJECTS
 
 _MMDET3D = """# python HERE/lists.py, and then tools/train.py HERE/mixed.py of MMDetection3D
 _base_ = ["BASE"]
@@ -149,25 +148,24 @@ MIX = "mix.yaml"
 _WORDS = re.compile(r"\b(?:ROOT|MIX|HERE)\b|OPTIONS")
 
 DEFAULTS: dict[str, dict[str, Any]] = {
-    "segmentation": {
-        "ratio": {"synthetic_first": 40},
-        "labels": TOWN_OBJECTS,
-        "epoch_size": "replace",
-    },
+    "segmentation": {"epochs": 40},
     "detection": {
         "ratio": {"synthetic_first": 40},
         "labels": "boxes",
         "epoch_size": "replace",
     },
 }
-"""Settings of the recipes that gained, for 40 epochs: synthetic scans alone in three quarters of
-them, then half and half, real ones at the end (docs/research/proof.md,
-docs/research/detectors.md)."""
+"""Settings of the recipes that gained, for 40 epochs of the trainer: that of ``mix``, by the number
+of its scans (docs/research/proof.md); for a detector, synthetic scans alone in three quarters of
+them, then half and half, real ones at the end (docs/research/detectors.md)."""
 
 
 def write_mixture(settings: dict[str, Any]) -> str:
-    """The settings of a mixture as YAML."""
-    return yaml.safe_dump(settings, sort_keys=False)
+    """The settings of a mixture as YAML, with the number of epochs if they follow a schedule."""
+    text = yaml.safe_dump(settings, sort_keys=False)
+    if isinstance(settings.get("ratio"), float):
+        return text
+    return f"# For a training of 40 epochs: set the trainer to as many.\n{text}"
 
 
 def tasks_of(trainer: str) -> list[str]:

@@ -37,6 +37,8 @@ damaged."""
 
 NOTE = "cache.json"
 """The file beside the arrays that says what they hold, with the checksums of their blocks."""
+FILES = "files"
+"""The fact about the files of the scans, which earlier versions did not note."""
 
 
 def make_arrays(
@@ -162,6 +164,8 @@ def _read_note(folder: Path, facts: dict[str, Any], layout: Layout) -> list[int 
     """
     found = read_sealed(folder / NOTE, "the notes of a cache")
     sums = found.pop("sums", None)
+    if FILES in facts:
+        found.setdefault(FILES, facts[FILES])
     if found != facts:
         differs = [key for key in found | facts if found.get(key) != facts.get(key)]
         raise ConfigError(

@@ -1,6 +1,7 @@
 """Training data on disk: scans kept as compact range images, projected once, with checksums."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,12 +14,14 @@ from torch import Tensor
 
 from lidar_synth.bank.encoding import LEVELS, TYPES, Encoding
 from lidar_synth.errors import DataError
+from lidar_synth.files.disk import hash_of_names
+from lidar_synth.formats import ScanFiles
 from lidar_synth.generate.codec import Codec
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.lab.train.arrays import Arrays, Layout, make_arrays
+from lidar_synth.lab.train.arrays import FILES, Arrays, Layout, make_arrays
 from lidar_synth.lab.train.ranks import ALONE, Ranks
 
 DTYPES: dict[str, type[np.generic]] = {
@@ -102,7 +105,7 @@ def cache_scans(
         sensor: defines the grid.
         channels: names of ``DTYPES``.
         folder: keep the cache there, memory-mapped: a second call finds it, an interrupted one goes
-            on; by default the cache is in memory.
+            on, unless a file of the source has changed; by default the cache is in memory.
         description: what tells this source from another one, plain values; stands beside the cache.
         progress: show a bar.
         others: {name: what else to keep}.
@@ -132,6 +135,8 @@ def cache_scans(
     }
     if others:
         facts["others"] = {name: other.facts for name, other in others.items()}
+    if folder is not None and (files := _hash_of_files(source, folder)):
+        facts[FILES] = files
 
     make = _Project(source, sensor, tuple(names), others)
     spread = 1 if others else jobs
@@ -139,6 +144,31 @@ def cache_scans(
         make_arrays(layout, make, "scans", folder, facts, ranks, progress, spread),
         sensor,
     )
+
+
+def _hash_of_files(source: Any, cache: Path) -> str | None:
+    """A hash of the ids of a source, and of the names, sizes and modification times of the files at
+    its root, or at those of several; None for scans that are no files, such as the town's."""
+    told: list[str] = []
+    for part in getattr(source, "datasets", [source]):
+        if isinstance(part, ScanFiles):
+            told += [*part.ids, *_tell_files(part.root, cache)]
+    return hash_of_names(told) if told else None
+
+
+def _tell_files(root: Path, cache: Path) -> Iterator[str]:
+    """Name, size and modification time of each file below a folder; or of the file."""
+    # A run that lies among its scans writes beside its cache.
+    own = {cache.resolve(), cache.parent.resolve()}
+    paths = [root]
+    for folder, names, files in os.walk(root, followlinks=True):
+        names[:] = [n for n in names if Path(folder, n).resolve() not in own]
+        paths += [Path(folder, name) for name in files if name[0] != "."]
+    for path in sorted(paths):
+        if path.is_file():
+            found = path.stat()
+            name = path.relative_to(root).as_posix()
+            yield f"{name} {found.st_size} {int(found.st_mtime)}"
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,11 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.generate.checkpoint import Header
-from lidar_synth.generate.flow.path import Velocity
+from lidar_synth.generate.flow.path import METRICS, Velocity
 from lidar_synth.generate.flow.timesteps import Selection, TrajectoryCosts, sum_costs
 from lidar_synth.lab.train.config import DistillConfig
 from lidar_synth.lab.train.data import Batches
+from lidar_synth.lab.train.loop import weigh_metric
 from lidar_synth.lab.train.ranks import ALONE, Ranks
 from lidar_synth.lab.train.resume import flatten
 from lidar_synth.lab.train.state import checksum_of
@@ -84,12 +85,13 @@ class TimestepSelection:
         given = self.config.selection
         if self.done is not None and len(self.done.optima) == given.trajectories:
             return self.done.selection
+        recipe = self.config.recipe
         saved = time.monotonic()
         for costs in sum_costs(
             velocity,
             shape,
             self.config.intervals,
-            metric=self.config.recipe.metric,
+            metric=weigh_metric(METRICS[recipe.metric], recipe.weights, data.tensors),
             device=data.device,
             condition=data.conditions if self.conditional else None,
             progress=ranks.first,
@@ -124,6 +126,8 @@ def selection_settings(config: DistillConfig, header: Header) -> dict[str, Any]:
         # How many trajectories run at a time changes rounding only.
         "selection": config.selection.model_dump(exclude={"batch"}),
     }
+    if config.recipe.weights:
+        settings["weights"] = dict(config.recipe.weights)
     if config.weaker is not None:
         settings["weaker"] = header.provenance["weaker"]
         settings["within"] = config.within

@@ -250,9 +250,16 @@ class Stage:
 
 def hash_encoder(autoencoder: nn.Module) -> str:
     """Hash of what decides an autoencoder's latents: the same for decoders trained further."""
-    if not isinstance(autoencoder, BoundedAutoencoder):
-        return network_hash(autoencoder)
-    chosen = set(map(id, autoencoder.encoder()))
-    kept: dict[str, Tensor] = dict(autoencoder.named_buffers())
-    kept |= {n: p for n, p in autoencoder.named_parameters() if id(p) in chosen}
-    return weights_hash({name: value.detach().cpu() for name, value in kept.items()})
+    return weights_hash(latent_weights(autoencoder))
+
+
+def latent_weights(autoencoder: nn.Module) -> dict[str, Tensor]:
+    """The weights and buffers that decide an autoencoder's latents, by name, on the CPU; all of
+    them where its decoder cannot be trained alone."""
+    kept = autoencoder.state_dict()
+    if isinstance(autoencoder, BoundedAutoencoder):
+        chosen = set(map(id, autoencoder.encoder()))
+        parameters = autoencoder.named_parameters()
+        names = {name for name, p in parameters if id(p) in chosen}
+        kept = {n: v for n, v in kept.items() if n in names | {"shift", "scale"}}
+    return {name: value.cpu() for name, value in kept.items()}

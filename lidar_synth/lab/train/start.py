@@ -44,6 +44,7 @@ def open_networks(config: TrainConfig) -> Opened:
         FileError, DataError: where they cannot be read.
     """
     if config.init is not None:
+        torch.manual_seed(config.seed)  # of what the checkpoint lacks
         return start_networks(config, config.init)
     return fresh_networks(config)
 

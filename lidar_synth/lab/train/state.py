@@ -52,7 +52,7 @@ class Recipe:
         betas, weight_decay: of AdamW; the weight decay also applies to Muon.
         schedule: a name of ``SCHEDULES``.
         warmup: steps until the full rate is reached.
-        clip: maximum norm of the gradient.
+        clip: maximum norm of the gradient; a large one, such as 1.0e+9, does not clip.
         ema_decay: decay of the averaged weights at each update; smaller in the first updates.
         ema_every: steps between these updates.
         ema_after: steps until averaging begins, up to which the averaged weights are the network's
@@ -101,10 +101,12 @@ class Recipe:
         if (
             min(self.iterations, self.batch, self.accumulate, self.ema_every) < 1
             or not self.rate > 0
+            or not self.clip > 0
         ):
             raise ConfigError(
                 f"{self}",
-                "iterations, batch, accumulate, ema_every of at least 1 and a rate above 0",
+                "iterations, batch, accumulate, ema_every of at least 1, a rate and a clip above "
+                "0 (a large clip, such as 1.0e+9, does not clip)",
             )
 
 

@@ -36,10 +36,15 @@ from lidar_synth.lab.train.precision import choose_precision, convert_products
 from lidar_synth.lab.train.provenance import provenance_of
 from lidar_synth.lab.train.ranks import ALONE, Ranks
 from lidar_synth.lab.train.selection import TimestepSelection
-from lidar_synth.lab.train.stage import Stage, Task
+from lidar_synth.lab.train.stage import Stage, Task, latent_weights
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
+
+
+ROUNDING = 2**-7
+SMALL = 1e-6
+"""Relative and absolute differences of weights that were stored in float16 or bfloat16."""
 
 
 def student_task(
@@ -93,7 +98,7 @@ class StudentStage(Stage):
         start = load_checkpoint(find_model(config.init or config.teacher))
         networks = start.networks
         if config.init is not None:
-            header = _add_times(config, header, start)
+            header = _add_times(config, header, teacher, start)
         if config.also:
             header = _add_ends(config, networks, header)
             self.loss = balanced_velocity_loss
@@ -150,21 +155,26 @@ def _check_teacher(config: DistillConfig, teacher: Checkpoint) -> None:
         )
 
 
-def _add_times(config: DistillConfig, header: Header, start: Checkpoint) -> Header:
+def _add_times(
+    config: DistillConfig, header: Header, teacher: Checkpoint, start: Checkpoint
+) -> Header:
     """Take the times of a student that is trained further.
 
     Raises:
-        ConfigError: if it is the student of another kind of teacher, or of other numbers of
-            steps.
+        ConfigError: if it is the student of another kind of teacher, of one on other latents, or of
+            other numbers of steps.
     """
     shared = ("sensor", "channels", "normalisation", "conditioning")
     differs = [k for k in shared if getattr(header, k) != getattr(start.header, k)]
+    if not _same_latents(teacher, start):
+        differs.append("autoencoder")
     grids = (start.header.time_grid, *start.header.other_grids)
     intervals = [len(grid) - 1 for grid in grids]
     wanted = [config.intervals, *config.also]
     if differs or intervals != wanted:
         raise ConfigError(
-            f"init {config.init} with {', '.join(differs) or f'{intervals} steps'}",
+            f"init {config.init} with "
+            + (f"another {', '.join(differs)}" if differs else f"{intervals} steps"),
             f"a student of {config.teacher} in {wanted} steps",
         )
     made = {"init": start.hash, "init_provenance": start.header.provenance}
@@ -173,6 +183,18 @@ def _add_times(config: DistillConfig, header: Header, start: Checkpoint) -> Head
         time_grid=grids[0],
         other_grids=grids[1:],
         provenance=header.provenance | made,
+    )
+
+
+def _same_latents(one: Checkpoint, other: Checkpoint) -> bool:
+    """Whether the autoencoders of two models encode alike, up to the rounding of stored weights."""
+    a, b = (
+        latent_weights(c.networks[CODEC]) if CODEC in c.networks else {}
+        for c in (one, other)
+    )
+    return a.keys() == b.keys() and all(
+        v.shape == b[n].shape and torch.allclose(v, b[n], ROUNDING, SMALL)
+        for n, v in a.items()
     )
 
 
@@ -192,8 +214,10 @@ def _add_ends(
         raise ConfigError(
             f"{given} for a {held.architecture} by {config.strategy}",
             "an hdit, adaptive_piecewise",
+            "Give also=[] for one number of steps.",
         )
     part = held._replace(arguments=held.arguments | {"ends": True})
+    torch.manual_seed(config.seed)
     velocity = build_network(*part)
     velocity.load_state_dict(networks[VELOCITY].state_dict(), strict=False)
     networks[VELOCITY] = velocity

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND, IGNORE
+from lidar_synth.datasets.classes import GROUND, has_ground
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grow_box, widen_boxes
@@ -208,11 +208,11 @@ def remove_returns(
 
 
 def _ground(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:
-    """(E,) True for returns of the ground: by their labels, or without labels where a ring is level
-    and low."""
+    """(E,) True for returns of the ground: by their labels, or without labels of the ground where a
+    ring is level and low."""
     ground = np.zeros(len(rays.point), bool)
     there = rays.point >= 0
-    if scan.label is not None and (scan.label != IGNORE).any():
+    if has_ground(scan.label):
         ground[there] = GROUND[scan.label[rays.point[there]]]
     else:
         low = np.percentile(scan.points[:, 2], 10) + 0.5 if len(scan) else 0.0

@@ -216,7 +216,8 @@ class VQVAE(Autoencoder):
             mask             distance of the mask, where there is one, to 1 = return and -1 = none
             geometric        squared distance of points, each the mean of four neighbours in a row,
                              in units of the maximum range: preserves the curves that beams trace
-            adversarial      the discriminator's hinge loss
+            adversarial      the discriminator's hinge loss; in training alone, with gradients:
+                             measured by a discriminator that changes, images cannot be compared
         """
         losses = objective.losses
         result = self(x)
@@ -230,7 +231,7 @@ class VQVAE(Autoencoder):
         if losses.geometric:
             off = objective.points(output) - objective.points(x)
             loss = loss + losses.geometric * off.square().sum(1).mean()
-        if objective.discriminator is not None:
+        if objective.discriminator is not None and torch.is_grad_enabled():
             image = expected(output, objective.tensors)
             loss = loss + self._adversarial(
                 objective.discriminator, image, x, loss, objective
@@ -261,8 +262,6 @@ class VQVAE(Autoencoder):
     def _balance(self, reconstruction: Tensor, fooled: Tensor) -> Tensor:
         """Ratio of the gradient norms of both terms at the decoder's last layer, at most 10^4."""
         last = self.decoder.head.weight
-        if not (torch.is_grad_enabled() and last.requires_grad):
-            return fooled.new_zeros(())
         one, other = (
             torch.autograd.grad(x, last, retain_graph=True)[0].norm()
             for x in (reconstruction, fooled)

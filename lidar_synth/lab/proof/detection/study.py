@@ -18,7 +18,7 @@ from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names, write_file
 from lidar_synth.files.parsing import read_sealed, seal
-from lidar_synth.formats import open_scans
+from lidar_synth.formats import KITTIObject, open_scans
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.generate.devices import check_device
 from lidar_synth.geometry.overlap import count_overlapping
@@ -101,6 +101,12 @@ class DetectionSettings:
         return [name for name in ARMS if name in {BASE, *self.arms}]
 
 
+def with_boxes(source: Source) -> Source:
+    """A source as detectors learn from it: of KITTI's object set, the scans with boxes, in the
+    camera's view."""
+    return source.with_boxes() if isinstance(source, KITTIObject) else source
+
+
 def half_of(
     places: Places,
     seed: int,
@@ -157,7 +163,9 @@ class DetectionWork:
             if not path.exists():
                 index = stretch * STRETCH_FRAMES + MOMENTS[moment]
                 write_scan(path, with_points(town[index]))
-        return open_scans(self.pool)
+        kept = open_scans(self.pool)
+        kept.ids = kept.ids[:count]  # other comparisons may have made more
+        return kept
 
     @cached_property
     def objects(self) -> ObjectBank:
@@ -284,7 +292,8 @@ def prove_detection(
     add arms and seeds.
 
     Args:
-        scans: real scans with boxes: what ``open_scans`` opens, or a source.
+        scans: real scans with boxes: what ``open_scans`` opens, or a source. KITTI's object set is
+            cropped to the camera's view (``KITTIObject.with_boxes``).
         out: folder to write to: outcomes, ``results.json`` and the page ``index.html``.
         settings: of the comparison.
         minutes: no training begins after so many.
@@ -303,7 +312,7 @@ def prove_detection(
     start = time.monotonic()
     out = Path(out)
     settings = settings or DetectionSettings()
-    source = open_scans(scans) if isinstance(scans, str | Path) else scans
+    source = with_boxes(open_scans(scans) if isinstance(scans, str | Path) else scans)
     work = DetectionWork(source, settings, out, Path(pools or out / "town"), device)
     truths = _truths(source)
     claim(out / "study.json", _identity(work))
@@ -361,6 +370,7 @@ def _identity(work: DetectionWork) -> dict[str, Any]:
     for name in ("arms", "seeds", "labelled"):  # they add trainings
         del own[name]
     scans = hash_of_names(names_of(work.source))
+    own |= getattr(work.source, "options", {})
     # Protocol 1 had another schedule; 2 settled each network. Their folders are refused.
     return {"scans": scans, "protocol": 3, **own}
 

@@ -91,6 +91,7 @@ class AdaptPlan:
             "with their labels"
             if self.labelled
             else "without labels: generated labels are the model's own guess, learnt on the town",
+            *self._lost(),
             f"at most {self.minutes:g} minutes:",
             *(
                 f"  {name:<10} {minutes:6.1f}  {self.stages[name].about}"
@@ -99,6 +100,17 @@ class AdaptPlan:
             f"the folder {self.work} keeps what is needed to resume",
         ]
         return "\n".join(lines)
+
+    def _lost(self) -> list[str]:
+        """The numbers of steps that the model knows and the adapted one does not."""
+        header = self.model.header
+        if not header.other_grids:
+            return []
+        others = " and ".join(str(len(grid) - 1) for grid in header.other_grids)
+        return [
+            f"a student of {len(header.time_grid) - 1} steps: the times of {others} steps, which "
+            f"{self.name} knows, are lost"
+        ]
 
 
 def plan_adaptation(

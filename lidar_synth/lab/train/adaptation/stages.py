@@ -33,6 +33,13 @@ UNLABELLED = 0.5
 """Share of the town's images that an autoencoder labels without having seen their labels."""
 
 
+FEW_STEPS = 16
+"""Most steps of a student. The grid of a model of more is a teacher's: its student gets one of its
+own."""
+SELECTION = {"candidates": 50, "trajectories": 32}
+"""Of that grid: as for the shipped models, some minutes on a processor."""
+
+
 class AdaptationStage(NamedTuple):
     """One training.
 
@@ -170,12 +177,11 @@ class Work:
             "recipe": {"iterations": ENDLESS},
         }
         if name == "student":
+            values["teacher"] = str(start)
             grid = self.header.time_grid
-            return values | {
-                "teacher": str(start),
-                "grid": list(grid),
-                "intervals": len(grid) - 1,
-            }
+            if len(grid) - 1 <= FEW_STEPS:
+                return values | {"grid": list(grid), "intervals": len(grid) - 1}
+            return values | {"selection": SELECTION}
         if name == "codec" and self.town:
             town = self._town(TOWN_SEED, self.town)
             values["rehearsal"] = town | {"flip": True, "roll": True}

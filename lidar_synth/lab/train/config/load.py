@@ -1,5 +1,6 @@
 """From a recipe to checked values; unknown keys are refused, with the known ones named."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -68,16 +69,31 @@ def read_values(given: str | Path, kind: type[BaseModel]) -> dict[str, Any]:
     return values
 
 
+_BEGINNINGS = {
+    "warmup": "the learning rate does not reach recipe.rate before the end",
+    "ema_after": "no weights are averaged",
+}
+
+
 def check(config: Run) -> None:
-    """Refuse what could not be built.
+    """Refuse what could not be built, and warn of a run too short for its recipe.
 
     Raises:
         ConfigError: naming it.
     """
-    for data in (config.data, *([config.held_out.data] if config.held_out else [])):
-        if (data.town is None) == (data.path is None):
-            raise ConfigError(
-                f"data with town={data.town} and path={data.path}", "one of the two"
+    held = config.held_out.data if config.held_out else None
+    for data in filter(None, (config.data, held, config.rehearsal)):
+        for one in data.parts():
+            if (one.town is None) == (one.path is None):
+                raise ConfigError(
+                    f"data with town={one.town} and path={one.path}", "one of the two"
+                )
+    iterations = config.recipe.iterations
+    for key, effect in _BEGINNINGS.items():
+        if (steps := getattr(config.recipe, key)) >= iterations:
+            warnings.warn(
+                f"recipe.{key}={steps} with recipe.iterations={iterations}: {effect}; give less",
+                stacklevel=3,
             )
     if isinstance(config, TrainConfig):
         _check_train(config)

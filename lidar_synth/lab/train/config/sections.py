@@ -37,7 +37,8 @@ class Data(Section):
         path: a dataset's root, a folder or a file; environment variables are expanded.
         layout, split: as for ``open_scans``.
         on_bad: "error", or "skip" to leave out scans that cannot be read.
-        cache: folder of the projected scans; by default ``cache`` in the output folder.
+        cache: folder of the projected scans; by default ``cache`` in the output folder. It is
+            refused if a file of the scans has another size or modification time since.
         jobs: processes that project the scans for the cache, without images.
         flip: mirror every other sample, left to right; "both" = front to back too.
         roll: rotate every sample by a random number of columns, or by as many degrees at most.
