@@ -21,6 +21,7 @@ from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.lab.cli.curate import curate
 from lidar_synth.lab.curate import FILE, MEANINGS, read_scores, score, write_scores
 from lidar_synth.lab.curate.features import MEASURES, features
 from lidar_synth.lab.curate.scores import FARTHEST
@@ -287,6 +288,14 @@ def test_the_command_lists_plots_and_drops(bank: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_the_help_names_every_score() -> None:
+    assert curate.__doc__ is not None
+    listed = curate.__doc__.partition("Scores:")[2].partition("Examples:")[0]
+    assert {line.split()[0] for line in listed.splitlines() if line.strip(" \b")} == {
+        *MEANINGS
+    }
+
+
 def test_the_plot_counts_every_scan_and_marks_some() -> None:
     rng = np.random.default_rng(0)
     values = {name: rng.random(50) for name in MEANINGS}

@@ -73,6 +73,7 @@ def curate(
       range       distance of the range histogram to the mean histogram, 0 to 0.83
       labels      distance of the class histogram to the mean histogram, 0 to 0.83
       empty       share of cells without a return
+      isolated    share of returns without three neighbours at almost the same range
       unlabelled  share of returns without a label
       floating    share of ground returns above the sensor
       speckle     share of neighbouring returns on one surface with different labels
