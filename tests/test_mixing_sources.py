@@ -12,7 +12,7 @@ from mixed import Theirs, loader, mixed
 from mixtures import Endless, Scans, as_is
 from test_generator import SENSOR as GENERATED_SENSOR
 from test_generator import write
-from torch.utils.data import DataLoader, IterableDataset, Subset
+from torch.utils.data import ConcatDataset, DataLoader, IterableDataset, Subset
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
@@ -103,6 +103,8 @@ def test_sources_that_differ_have_different_plans() -> None:
     ]
     assert len({identity_of(part) for part in parts}) == 4
     assert identity_of(Subset(parts[0], [1])) != identity_of(Subset(parts[1], [1]))
+    joined = [ConcatDataset([part, parts[0]]) for part in parts]
+    assert len({identity_of(one) for one in joined}) == 4
     same: Any = Subset(Town(0, scans=50), range(2))  # type: ignore[arg-type]
     assert identity_of(same) == identity_of(parts[0])
     scans = Scans("a", 3, load_sensor("hdl64e_kitti"))

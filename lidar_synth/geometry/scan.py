@@ -394,10 +394,13 @@ class Source(Protocol):
 
 def identity_of(source: Any) -> str:
     """A text that identifies a source: its ``identity``, or its class, its length and a hash of its
-    scans' names; of torch's ``Subset``, a hash of its dataset's identity and its indices."""
+    scans' names; of torch's ``Subset``, a hash of its dataset's identity and its indices, and of
+    ``ConcatDataset`` one of its datasets' identities."""
     if own := getattr(source, "identity", ""):
         return str(own)
     names = getattr(source, "ids", ())
+    if isinstance(parts := getattr(source, "datasets", None), Iterable):
+        names = map(identity_of, parts)
     dataset = getattr(source, "dataset", None)
     indices = getattr(source, "indices", None)
     if isinstance(dataset, Sized) and isinstance(indices, Iterable):
