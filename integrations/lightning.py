@@ -259,15 +259,15 @@ class _Epochs:
         ranks."""
         steps = self._steps()
         trainer = self._data.trainer
-        done = (
-            trainer.fit_loop.epoch_loop.batch_progress.current.processed
-            if trainer
-            else 0
-        )
+        done = 0
+        last = len(steps)
+        if trainer:
+            done = trainer.fit_loop.epoch_loop.batch_progress.current.processed
+            last = min(last, trainer.num_training_batches)  # limit_train_batches
         mixture = self._batches.dataset.mixture
         place = (
             (self._epoch, steps[done].start)
-            if done < len(steps)
+            if done < last
             else after_epoch(mixture, self._epoch)
         )
         return make_state(mixture, *place) | {

@@ -15,6 +15,7 @@ get their boxes from the scan. ``mmdet3d_infos.write_infos`` writes the list,
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from lidar_synth.integrations.mixture import id_table, inner, require_ids
 from lidar_synth.integrations.mmdet3d_slots import (
     PREFIX,
     Folder,
+    draw_in_epoch,
     is_mixed,
     open_folder,
     read_url,
@@ -181,7 +183,7 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
         seed: not used: the runner draws another one if a run is resumed.
         options: ``shuffle`` and ``round_up`` of ``DefaultSampler``. Where an epoch has other
             entries than all of the list (a schedule, ``epoch_size``), they come in the plan's
-            order.
+            order, and steps such as LaserMix draw partners from them.
 
     Attributes:
         start: number of samples that the next pass leaves out.
@@ -194,7 +196,7 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
     def __init__(self, dataset: Any, seed: int | None = None, **options: Any) -> None:
         self.folders = _checked(dataset)
         folders = self.folders
-        super().__init__(dataset, seed=int(folders[0].settings["seed"]), **options)
+        super().__init__(dataset, seed=folders[0].mixed.seed, **options)
         dataset.__getitems__ = Fetch(dataset, [folder.path for folder in folders])
         self.start = 0
         self.planned = next((folder for folder in folders if not folder.whole), None)
@@ -206,7 +208,10 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
                 f"a dataset of {len(dataset)} samples around a mixed list of {listed} with a "
                 "schedule or epoch_size",
                 "the list's own dataset, not repeated or joined with others",
+                "Of a RepeatDataset: times=1.",
             )
+        [own] = [each for each in inner(dataset) if hasattr(each, "ann_file")]
+        own.pipeline.transforms.insert(0, partial(draw_in_epoch, self.planned.path))
         length = len(self.planned.mixed)
         self.num_samples = math.ceil(
             (length - (0 if self.round_up else self.rank)) / self.world_size

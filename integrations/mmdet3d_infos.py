@@ -98,7 +98,7 @@ def write_infos(
     facts: dict[str, Any] = {
         "format": FORMATS[-1],
         "real": len(entries),
-        "settings": _complete(settings),
+        "settings": _absolute(settings),
     }
     facts["layout"] = _layout(given, entries[0], layout, real)
     facts["view"] = None if view is False else camera
@@ -131,19 +131,14 @@ def _read(real: str | Path) -> Any:
     return load(str(real))
 
 
-def _complete(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings with defaults, and with absolute paths to the synthetic scans and a sensor."""
-    settings = {
-        "synthetic": settings.get("synthetic"),
-        "ratio": 0.25,
-        "labels": "generated",
-        "seed": 0,
-    } | settings
-    if not isinstance(settings["ratio"], int | float | list | dict):
+def _absolute(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings with absolute paths to the synthetic scans and a sensor."""
+    if not isinstance(settings.get("ratio"), int | float | list | dict | None):
         raise ConfigError(
             f"ratio={settings['ratio']!r} for a list",
             "a number, a list or {epoch: ratio}",
         )
+    settings = dict(settings)
     for name in ("synthetic", "as_sensor"):
         if isinstance(where := settings.get(name), str | Path) and Path(where).exists():
             settings[name] = str(Path(where).resolve())

@@ -96,7 +96,7 @@ class Folder:
             None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
         )
         self._cached: OrderedDict[tuple[int, int], Scan] = OrderedDict()
-        self._positions: tuple[int, NDArray[np.int64]] | None = None
+        self._entries: tuple[int, NDArray[np.int64]] | None = None
         self._epoch: int | None = None
 
     @classmethod
@@ -154,10 +154,12 @@ class Folder:
 
     def entries(self, epoch: int) -> NDArray[np.int64]:
         """(N,) the list's entries that an epoch has, in the order of its plan."""
-        plan = self.mixed.plan(epoch)
-        entries = plan.index.copy()
-        entries[plan.domain] = self.real + np.arange(plan.synthetics)
-        return entries
+        if self._entries is None or self._entries[0] != epoch:
+            plan = self.mixed.plan(epoch)
+            entries = plan.index
+            entries[plan.domain] = self.real + np.arange(plan.synthetics)
+            self._entries = (epoch, entries)
+        return self._entries[1]
 
     def scan(self, slot: int) -> Scan:
         """The scan of a slot in the current epoch, in the form of the dataset, with its labels and
@@ -184,9 +186,8 @@ class Folder:
             raise DataError(f"slot {slot} of {self.path}", f"0 to {self.slots - 1}")
         while not self.mixed.plan(epoch).synthetics:
             epoch -= 1
-        if self._positions is None or self._positions[0] != epoch:
-            self._positions = (epoch, np.flatnonzero(self.mixed.plan(epoch).domain))
-        return epoch, int(self._positions[1][slot % len(self._positions[1])])
+        positions = np.flatnonzero(self.entries(epoch) >= self.real)
+        return epoch, int(positions[slot % len(positions)])
 
 
 def _by_epoch(value: Any) -> Any:
@@ -198,6 +199,37 @@ def _by_epoch(value: Any) -> Any:
 
 open_folder = cache(Folder.open)
 """``Folder.open``, once per process and folder."""
+
+
+class EpochEntries:
+    """The entries of the current epoch as the dataset of a pipeline's steps, which draw partners
+    from it, as LaserMix does.
+
+    Args:
+        dataset: of the whole list.
+        folder: of the list.
+    """
+
+    def __init__(self, dataset: Any, folder: Folder) -> None:
+        self.dataset = dataset
+        self.folder = folder
+
+    def __len__(self) -> int:
+        return len(self.folder.mixed)
+
+    def get_data_info(self, index: int) -> dict[str, Any]:
+        """The trainer's entry at a position of the epoch, 0 <= index < length."""
+        entries = self.folder.entries(self.folder.epoch)
+        info: dict[str, Any] = self.dataset.get_data_info(int(entries[index]))
+        return info
+
+
+def draw_in_epoch(path: Path, results: dict[str, Any]) -> dict[str, Any]:
+    """The first step of the pipeline of a list in the folder ``path``: those after it draw partners
+    from the epoch's entries only. A detector's samples have no dataset, so that it draws none."""
+    if "dataset" in results:
+        results["dataset"] = EpochEntries(results["dataset"], open_folder(path))
+    return results
 
 
 @cache

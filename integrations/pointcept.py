@@ -12,6 +12,7 @@ zeros, which mean "car". Self-supervised pretraining reads no labels, so that it
 ``labels: none``.
 """
 
+import copyreg
 from collections.abc import Iterator
 from typing import Any
 
@@ -37,12 +38,24 @@ try:
     from pointcept.datasets.semantic_kitti import SemanticKITTIDataset
     from pointcept.engines.hooks.builder import HOOKS
     from pointcept.engines.hooks.default import HookBase
+    from pointcept.utils.config import Config
 except ImportError as error:
     raise LibraryError(
         f"pointcept cannot be imported ({error})",
         "a checkout of Pointcept",
         "PYTHONPATH=/path/to/Pointcept",
     ) from error
+
+
+def read_config(state: Any) -> Config:
+    """A configuration in a process that Pointcept starts for a GPU: to find this function, it
+    imports this module, which Pointcept's own reading of a pickled configuration does not."""
+    config = Config.__new__(Config)
+    config.__setstate__(state)
+    return config
+
+
+copyreg.pickle(Config, lambda config: (read_config, (config.__getstate__(),)))
 
 
 @DATASETS.register_module()

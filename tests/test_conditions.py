@@ -287,6 +287,13 @@ def test_the_position_embeddings_of_views_and_cells_are_used_and_trained() -> No
             r"conditions \['camera'\]; expected 'semantic' among them",
         ),
         ("semantic", [], ConfigError, "a condition of type list"),
+        ("semantic", ["map"] * 3, ConfigError, "a condition of type str"),
+        (
+            "semantic",
+            [np.zeros(SENSOR.shape, np.uint8)] * 2,
+            DataError,
+            r"semantic condition of shape \(2, ",
+        ),
         (
             "camera",
             np.zeros((3, 32, 60), np.uint8),
@@ -301,6 +308,18 @@ def test_invalid_conditions_are_refused(
     shape = SENSOR.shape if name == "semantic" else CAMERA_SHAPE
     with pytest.raises(error, match=message):
         batch_of(name, given, 3, SENSOR, shape, OPTIONS)
+
+
+def test_one_condition_for_each_scan_in_every_form(tmp_path: Path) -> None:
+    scan = some_scan(tmp_path)
+    shape = SENSOR.shape
+    maps = [np.full(shape, n, np.uint8) for n in range(2)]
+    maps.append(CONDITIONS["semantic"].read(scan, SENSOR, shape, {}))
+    expected = torch.from_numpy(np.stack(maps))
+    tensors = [torch.from_numpy(each) for each in maps]
+    dictionaries = [{"semantic": each} for each in maps]
+    for given in (maps, tuple(tensors), dictionaries, [*maps[:2], scan], expected):
+        assert torch.equal(batch_of("semantic", given, 3, SENSOR, shape, {}), expected)
 
 
 def test_scans_without_the_condition_are_refused(tmp_path: Path) -> None:

@@ -454,7 +454,10 @@ def test_a_drawn_road_is_level_where_rays_start_above_the_origin(
     removed = GROUND[scan.label] & (x > 6) & (x < 20) & (np.abs(y) < 0.15 * x)
     box = np.array([13, 0, -1, 10, 3, 2, 0], np.float32)
     result = remove_returns(
-        scan, [(removed, box)], SimpleNamespace(condition=None, sensor=sensor), 0
+        scan,
+        [(removed, box)],
+        SimpleNamespace(condition=None, header=SimpleNamespace(sensor=sensor)),
+        0,
     )
     assert removed.sum() > 500 and np.allclose(result.points, scan.points, atol=1e-3)
 

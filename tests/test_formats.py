@@ -79,6 +79,26 @@ def test_labels_are_read_back_bit_for_bit(tmp_path: Path, to: str) -> None:
 
 
 @pytest.mark.parametrize("to", ["pcd", "ply", "npz", "webdataset", "mcap"])
+def test_every_field_of_boxes_is_read_back(tmp_path: Path, to: str) -> None:
+    scan = some_scan()
+    scan.boxes = Boxes(
+        np.array([(8, 1, 0, 4, 2, 1.5, 0.1)]),
+        ("Car",),
+        truncation=np.array([0.3]),
+        occlusion=np.array([2]),
+        image_box=np.array([(1, 2, 30, 40.5)]),
+        instance=np.array([7]),
+        alpha=np.array([-0.2]),
+        dont_care=np.array([(1, 2, 3, 4)]),
+    )
+    write_all(to, tmp_path, [scan])
+    read = back(to, tmp_path)[0].boxes
+    for field in fields(Boxes):
+        sent = getattr(scan.boxes, field.name)
+        assert same(np.asarray(getattr(read, field.name)), np.asarray(sent)), field.name
+
+
+@pytest.mark.parametrize("to", ["pcd", "ply", "npz", "webdataset", "mcap"])
 def test_every_field_of_a_point_is_read_back(tmp_path: Path, to: str) -> None:
     scan = some_scan()
     scan.ring = np.arange(len(scan), dtype=np.int16) % 64
@@ -484,6 +504,35 @@ def test_splits(tmp_path: Path) -> None:
         "lidm/val": [3],
         "lidm-camera/train": [0, 4, 5, 6, 7, 8, 9, 10],
     }
+
+
+@pytest.mark.parametrize("below", ["sequences", "sequences/00", "moved"])
+def test_sequences_keep_their_labels_wherever_they_are_opened(
+    tmp_path: Path, below: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans = [some_scan(i, count=40) for i in range(2)]
+    write_all("semantic_kitti", tmp_path, scans)
+    if below == "moved":
+        (tmp_path / "sequences" / "00").rename(tmp_path / "moved")
+        (tmp_path / "moved" / "calib.txt").unlink()
+    monkeypatch.chdir(tmp_path / below)
+    for root in (tmp_path / below, Path()):
+        read = open_scans(root)
+        assert type(read) is SemanticKITTI
+        sequence = "moved" if below == "moved" else "00"
+        assert read.ids == (f"{sequence}/000000", f"{sequence}/000001")
+        assert same(read[1].label, scans[1].label)
+    assert type(open_scans(tmp_path / below / "..")) is SemanticKITTI
+
+
+def test_drives_of_kitti360_are_not_those_of_kitti_raw(tmp_path: Path) -> None:
+    """Their folders are alike; the sensors and the recordings are others."""
+    write_all("kitti360", tmp_path, [some_scan()])
+    assert type(open_scans(tmp_path)) is KITTI360
+    raw = tmp_path / "data_3d_raw"
+    for root in (raw, raw / "2013_05_28_drive_0000_sync"):
+        with pytest.raises(DataError, match="Give the folder that holds data_3d_raw"):
+            open_scans(root)
 
 
 def test_image_sets_choose_the_frames(tmp_path: Path) -> None:

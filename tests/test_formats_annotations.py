@@ -7,17 +7,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from layouts import MAKERS, a_pose, some_boxes, some_camera, some_scan, write_all
+from layouts import (
+    MAKERS,
+    a_pose,
+    nuscenes_arrays,
+    some_boxes,
+    some_camera,
+    some_scan,
+    write_all,
+)
 from roundtrips import back, same
 from streets import CAMERA, kitti
 
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.datasets.classes import KITTI360 as KITTI360_CLASSES
-from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, open_scans
+from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.disk import read_named_matrices, write_named_matrices
+from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, KITTIRaw, open_scans
 from lidar_synth.formats.calibration import in_view
 from lidar_synth.formats.point_labels import decode_labels, encode_labels
 from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.lab.proof.detection.study import with_boxes
 
 
 @pytest.mark.parametrize("to", ["semantic_kitti", "kitti_object", "kitti360"])
@@ -50,6 +60,25 @@ def test_the_camera_is_read_back(tmp_path: Path, to: str) -> None:
             file.read_text()
             == (tmp_path / file.relative_to(tmp_path / "again")).read_text()
         ), file
+
+
+def test_every_camera_of_kitti360_is_written(tmp_path: Path) -> None:
+    """Its own tools require four cameras; those that it has go on as they are."""
+    write_all("kitti360", tmp_path / "a", [some_scan()], calibration=some_camera())
+    folder = tmp_path / "a" / "calibration"
+    mounts = read_named_matrices(folder / "calib_cam_to_pose.txt")
+    assert list(mounts) == [f"image_0{k}" for k in range(4)]
+    cameras = read_named_matrices(folder / "perspective.txt")
+    names = {f"{kind}_rect_0{k}" for kind in "PRS" for k in range(2)}
+    assert set(cameras) == names
+    assert same(cameras["P_rect_01"], cameras["P_rect_00"])
+    cameras |= {"P_rect_01": 2 * cameras["P_rect_01"], "K_01": np.eye(3).ravel()}
+    write_named_matrices(folder / "perspective.txt", cameras)
+    read = KITTI360(tmp_path / "a").calibration(0)
+    write_all("kitti360", tmp_path / "b", [some_scan()], calibration=read)
+    again = read_named_matrices(tmp_path / "b" / "calibration" / "perspective.txt")
+    assert set(again) == {*names, "K_01"}
+    assert all(same(again[name], values) for name, values in cameras.items())
 
 
 @pytest.mark.parametrize("to", ["semantic_kitti", "kitti_object", "kitti360"])
@@ -267,6 +296,37 @@ def test_a_detector_gets_scans_with_boxes_in_the_view(tmp_path: Path) -> None:
         scans.with_boxes()
 
 
+def test_a_detector_gets_drives_with_tracklets_in_the_view(tmp_path: Path) -> None:
+    drive = MAKERS["kitti_raw"](tmp_path)[0].parents[2]
+    cropped = KITTIRaw(tmp_path).with_boxes()
+    with pytest.raises(DataError, match="without calibration"):
+        cropped[0]
+    to_camera = CAMERA.camera_from_sensor
+    write_named_matrices(
+        drive.parent / "calib_velo_to_cam.txt",
+        {"R": to_camera[:3, :3], "T": to_camera[:3, 3]},
+    )
+    write_named_matrices(
+        drive.parent / "calib_cam_to_cam.txt",
+        {
+            "R_rect_00": np.eye(3),
+            "P_rect_02": CAMERA.projection,
+            "S_rect_02": np.array(CAMERA.image_size),
+        },
+    )
+    scans = KITTIRaw(tmp_path)
+    assert scans.beyond_view and not cropped.beyond_view
+    assert with_boxes(scans).options == cropped.options != scans.options
+    assert cropped.ids == scans.ids
+    for whole, part in zip(scans, cropped, strict=True):
+        assert same(part.points, in_view(whole, CAMERA).points)
+        assert 0 < len(part) < len(whole)
+    assert [len(scan.boxes or ()) for scan in cropped] == [0, 1, 1]
+    (drive / "tracklet_labels.xml").unlink()
+    with pytest.raises(DataError, match="without boxes"):
+        scans.with_boxes()
+
+
 def test_an_object_that_the_images_edge_cuts_is_in_view() -> None:
     """KITTI labels it: without its box, its points would be background."""
     edge = 10 * CAMERA.projection[0, 2] / CAMERA.projection[0, 0]
@@ -382,9 +442,20 @@ def test_positions_of_kitti_tracklets_are_centres_of_the_floor(tmp_path: Path) -
     assert (third.occlusion[0], third.truncation[0], third.instance[0]) == (1, 0, 0)
 
 
-def test_nuscenes_labels_are_dropped_with_their_points(tmp_path: Path) -> None:
-    from layouts import nuscenes_arrays
+def test_versions_of_nuscenes_that_were_not_downloaded_do_not_matter(
+    tmp_path: Path,
+) -> None:
+    """lidarseg's archive has a table of each version."""
+    MAKERS["nuscenes"](tmp_path)
+    (tmp_path / "v1.0-test").mkdir()
+    (tmp_path / "v1.0-test" / "lidarseg.json").write_text("[]")
+    assert all(scan.label is not None for scan in open_scans(tmp_path))
+    (tmp_path / "v1.0-mini" / "sample_data.json").unlink()
+    with pytest.raises(FileError, match="sample_data"):
+        open_scans(tmp_path)
 
+
+def test_nuscenes_labels_are_dropped_with_their_points(tmp_path: Path) -> None:
     from lidar_synth.datasets.classes import NUSCENES
 
     MAKERS["nuscenes"](tmp_path)

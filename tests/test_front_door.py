@@ -230,6 +230,25 @@ def test_the_lists_of_mmdetection3d_are_written(tmp_path: Path) -> None:
     assert sorted((tmp_path / "scans").rglob("*")) == before
 
 
+def test_configurations_change_no_more_than_they_must(tmp_path: Path) -> None:
+    """A list with a schedule is not repeated, the final test stays, and CENet's log has a name."""
+
+    def configured(trainer: str, task: str) -> dict[str, Any]:
+        files = configure(trainer, task, DEFAULTS[task], here=str(tmp_path))
+        write_files(files, tmp_path)
+        return runpy.run_path(str(tmp_path / "mixed.py"))
+
+    dataset = configured("mmdet3d", "detection")["train_dataloader"]["dataset"]
+    assert dataset["times"] == 1
+    hooks = configured("pointcept", "segmentation")["hooks"]
+    assert hooks[-1] == {"type": "PreciseEvaluator", "test_last": False}
+    page = Path("docs/how-to/trainers/pointcept.md").read_text(encoding="utf-8")
+    for hook in hooks:
+        assert f'dict(type="{hook["type"]}"' in page
+    script = configure("rangenet", "segmentation", DEFAULTS["segmentation"])["train.sh"]
+    assert " -n " in script
+
+
 def test_the_recipes_command_writes_a_trainers_files(tmp_path: Path) -> None:
     given = f"recipes --trainer openpcdet --root KITTI --synthetic town --out {tmp_path / 'mixed'}"
     result = CliRunner().invoke(app, given.split())

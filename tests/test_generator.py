@@ -31,12 +31,13 @@ from lidar_synth.generate.checkpoint import (
 from lidar_synth.generate.conditions import GAP, bridge_gaps
 from lidar_synth.generate.flow.solvers import solve, uniform_grid
 from lidar_synth.generate.generator import Generator
+from lidar_synth.generate.inpaint import check_model, inpaint
 from lidar_synth.generate.loading import load_generator, shipped_models
 from lidar_synth.generate.models import NETWORKS, build_network
 from lidar_synth.generate.models.network import Autoencoder
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import SYNTHETIC
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage
 from lidar_synth.lab.town import Town
 from lidar_synth.noise import gaussian
 
@@ -482,3 +483,19 @@ def test_a_dense_model_generates_half_of_its_columns(tmp_path: Path) -> None:
         load_generator(path, columns=10)
     with pytest.raises(ConfigError, match="one of 2048, 1024"):
         load_generator("town", columns=512)
+
+
+def test_a_drawn_hole_leaves_what_surrounds_it_on_the_grid_of_the_training() -> None:
+    """Also for a model that decodes to fewer columns."""
+    generator = load_generator("town", columns=1024)
+    whole = load_generator("town")
+    [image] = whole.range_images(seed=0, indices=[0], steps=1)
+    hole = (image.range > 10) & (image.range < 15)
+    bare = RangeImage(image.range, image.sensor)
+    [drawn] = inpaint(generator, [bare], [hole], seed=1, indices=[0])
+    assert (drawn.channels["label"][~hole] == IGNORE).all()
+    assert not drawn.channels["reflectance"][~hole].any()
+    assert (drawn.channels["label"][hole & drawn.mask] != IGNORE).any()
+    narrow = r"\(64 x 1024\) for a model of .*\(64 x 2048\)"
+    with pytest.raises(DataError, match=narrow):
+        check_model(generator, generator.sensor)

@@ -203,11 +203,12 @@ def trainer(root: Path, epochs: int = 3, **options: Any) -> Any:
 
 
 @pytest.mark.parametrize("how", ["step", "exception", "epoch"])
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize(("workers", "limit"), [(0, 1.0), (2, 1.0), (0, 3)])
 def test_a_checkpoint_resumes_after_its_last_batch(
-    workers: int, how: str, tmp_path: Path
+    workers: int, limit: float, how: str, tmp_path: Path
 ) -> None:
-    """Taken after a training step, on an exception in the next one, or at an epoch's end."""
+    """Taken after a training step, on an exception in the next one, or at an epoch's end, also if
+    Lightning limits the batches of an epoch."""
     callbacks = lightning.pytorch.callbacks
     callback = {
         "step": callbacks.ModelCheckpoint(
@@ -221,15 +222,16 @@ def test_a_checkpoint_resumes_after_its_last_batch(
         mixed = MixedScans(Scans("r", 10), Endless(), ratio=0.25, seed=1)  # 14 samples
         return module.MixedData(mixed, batch_size=3, num_workers=workers)
 
+    silent = {"enable_checkpointing": False, "limit_train_batches": limit}
     whole = Model()
-    trainer(tmp_path, enable_checkpointing=False).fit(whole, data())
+    trainer(tmp_path, **silent).fit(whole, data())
     first = Stopping(1, 2)
     with pytest.raises(Stop):
-        trainer(tmp_path, callbacks=[callback]).fit(first, data())
+        trainer(tmp_path, callbacks=[callback], limit_train_batches=limit).fit(
+            first, data()
+        )
     rest = Model()
-    trainer(tmp_path, enable_checkpointing=False).fit(
-        rest, data(), ckpt_path=tmp_path / f"{how}.ckpt"
-    )
+    trainer(tmp_path, **silent).fit(rest, data(), ckpt_path=tmp_path / f"{how}.ckpt")
     kept = [sample for sample in first.seen if how != "epoch" or sample[0] == 0]
     assert kept + rest.seen == whole.seen
 

@@ -5,6 +5,7 @@ installed."""
 
 import importlib
 import os
+import re
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -338,6 +339,37 @@ def test_partners_are_real_and_synthetic(
     assert {p >= REAL for p in partners} == {False, True}
 
 
+def test_partners_follow_the_schedule(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trap: the trainer draws them from the whole list, which has synthetic slots in epochs of real
+    scans alone."""
+    listed = write_infos(
+        tmp_path / "seg",
+        made / "sk" / "train.json",
+        {
+            "synthetic": made / "synthetic",
+            "ratio": {0: 1.0, 1: 0.0},
+            "epoch_size": REAL,
+        },
+        data_root=made / "sk",
+    )
+    load = train_set("minkunet_semantickitti.py")["pipeline"][:3]
+    step: dict[str, Any] = {"type": "LaserMix", "pre_transform": load, "prob": 1.0}
+    step |= {"num_areas": [4], "pitch_angles": [-25, 3]}
+    dataset = segmentation(made, [step, PACK], ann_file=str(listed))
+    repeated = {"type": "RepeatDataset", "times": 1, "dataset": dataset}
+    sampler = adapter.SynthSampler(DATASETS.build(repeated))
+    drawn = []
+    inner = dataset.get_data_info
+    monkeypatch.setattr(dataset, "get_data_info", lambda i: drawn.append(i) or inner(i))
+    for epoch in (0, 1):
+        sampler.set_epoch(epoch)
+        drawn.clear()
+        sampler.dataset.__getitems__(list(sampler))
+        assert len(drawn) == 2 * REAL and {i < REAL for i in drawn} == {epoch == 1}
+
+
 def test_scans_without_a_box_are_not_replaced(made: Path, tmp_path: Path) -> None:
     """Trap: the stock setting replaces them, before ObjectSample can give them any, and the ratio
     is gone."""
@@ -521,7 +553,7 @@ def test_configurations_change_data_only(path: Path) -> None:
             reason="FRNet's repository is not on the path (PYTHONPATH and FRNET_ROOT)",
         )
     config = Config.fromfile(str(path))
-    stock = path.read_text().split('_base_ = ["')[1].split('"]')[0]
+    stock = re.findall(r'_base_ = \[\s*"(.+?)"', path.read_text())[0]
     stock = stock.replace("mmdet3d::", f"{Path(mmdet3d.__file__).parent}/.mim/configs/")
     ours = flat(bare(config.to_dict()))
     stock = stock.replace("{{$FRNET_ROOT:.}}", os.environ.get("FRNET_ROOT", "."))

@@ -5,6 +5,7 @@ import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,12 @@ from layouts import MAKERS, write_all
 from lidar_synth.integrations.detection import write_gt_database
 from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
-from lidar_synth.integrations.mmdet3d_slots import Folder, read_url
+from lidar_synth.integrations.mmdet3d_slots import (
+    Folder,
+    draw_in_epoch,
+    open_folder,
+    read_url,
+)
 from lidar_synth.integrations.nuscenes import CLASSES, as_nuscenes, five_values
 from streets import held, kitti, semantic_kitti, street, synthetic
 
@@ -316,23 +322,27 @@ def test_two_runs_that_share_a_list_have_their_own_epochs(
             },
             [(0, 8), (0, 8), (0, 8), (4, 4)],
         ),
+        ({"epochs": 4}, [(0, 100), (0, 100), (0, 100), (50, 50)]),
     ],
-    ids=["schedule", "ratio 1", "replace", "synthetic first"],
+    ids=["schedule", "ratio 1", "replace", "synthetic first", "recipe"],
 )
 def test_a_list_holds_schedules_and_lengths(
     scans: Path, tmp_path: Path, settings: dict[str, Any], shares: list[tuple[int, int]]
 ) -> None:
-    """An epoch's entries are those of its plan, and each slot has a scan of its own."""
+    """An epoch's entries, from which also partners are drawn, are those of its plan, and each slot
+    has a scan of its own."""
     real = semantic_kitti_list(
         semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json"
     )
     path = write_infos(
         tmp_path / "m",
         real,
-        MIX | {"synthetic": scans} | settings,
+        {"synthetic": scans, "seed": 3} | settings,
         data_root=tmp_path / "sk",
     )
-    folder = Folder.open(tmp_path / "m")
+    folder = open_folder(tmp_path / "m")
+    listed = SimpleNamespace(get_data_info=int)
+    partners = draw_in_epoch(tmp_path / "m", {"dataset": listed})["dataset"]
     assert (
         len(json.loads(path.read_text())["data_list"]) == REAL + folder.slots
         and not folder.whole
@@ -345,6 +355,8 @@ def test_a_list_holds_schedules_and_lengths(
             and slots <= folder.slots
         )
         folder.epoch, plan = epoch, folder.mixed.plan(epoch)
+        drawn = [partners.get_data_info(i) for i in range(len(partners))]
+        assert drawn == entries.tolist()
         slot = int(entries[plan.domain][-1]) - REAL
         assert (
             folder.scan(slot).id

@@ -5,6 +5,7 @@
 POINTCEPT_ROOT is a checkout; ``pointcept_cpu`` says how it runs without a GPU.
 """
 
+import pickle
 import re
 import sys
 from collections import Counter
@@ -133,6 +134,16 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
         assert {n for n in names if n.startswith("synthetic_")} == wanted
         seen.append(wanted)
     assert not seen[0] & seen[1]
+
+
+def test_a_process_for_another_gpu_registers_the_dataset() -> None:
+    """Trap: Pointcept runs ``custom_imports`` where it reads the configuration's file, and sends
+    other processes the configuration as a pickle."""
+    config = Config.fromfile(str(STOCK))
+    sent = pickle.dumps(config)
+    assert adapter.__name__.encode() in sent
+    read = pickle.loads(sent)
+    assert (read.data, read.filename) == (config.data, config.filename)
 
 
 def test_real_samples_are_the_trainers_own(made: Path) -> None:

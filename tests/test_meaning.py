@@ -230,6 +230,7 @@ def test_check_mix_shows_both_and_names_mistakes(tmp_path: Path) -> None:
     arguments = ["check-mix", str(settings), str(tmp_path / "real"), "--count", "4"]
     settings.write_text(
         f"synthetic: {write_folder(streets(2), tmp_path / 'synthetic')}\nratio: 0.1\n"
+        "loss_weight: 0.5\nclasses: {car: 3, road: 4}\n"
     )
     done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "mix.png")])
     assert done.exception is None and (tmp_path / "mix.png").stat().st_size > 10_000

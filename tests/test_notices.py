@@ -12,7 +12,7 @@ from streets import kitti, street
 from torch.utils.data import DataLoader
 
 from lidar_synth import mix
-from lidar_synth.formats import KITTIObject
+from lidar_synth.formats import WRITERS, KITTIObject, open_scans
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
 
@@ -119,6 +119,23 @@ def test_points_outside_of_the_view_that_has_boxes_are(
     assert "with_boxes()" not in caplog.text
     mix(real, [street(9)], task="detection", epochs=8)
     assert "Take open_scans" in caplog.text and "with_boxes()" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("sequences", "told"), [("00 08 11", True), ("00 01", False), ("08", False)]
+)
+def test_scans_of_validation_and_test_are(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, sequences: str, told: bool
+) -> None:
+    writer = WRITERS["semantic_kitti"](tmp_path)
+    for sequence in sequences.split():
+        writer.write(street(0), 0, name=f"{sequence}/000000")
+    writer.finish()
+    mix(tmp_path, [street(9)], 0.5)
+    assert ("split='train'" in caplog.text) == told
+    caplog.clear()
+    mix(open_scans(tmp_path), [street(9)], 0.5)
+    assert not caplog.text
 
 
 def test_a_sampler_made_anew_for_each_epoch_does_not_hide_a_repetition() -> None:

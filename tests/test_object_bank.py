@@ -1,6 +1,6 @@
 """The bank of objects: what it takes from scans, and its objects pasted into others."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -11,9 +11,10 @@ from box_scenes import CAR, HEIGHT, car, cast
 from hypothesis import given
 from pasting import assert_nothing_shares_a_ray
 
-from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI, TRAIN_ID
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.formats import KITTIObject, SemanticKITTI
+from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.overlap import count_overlapping, find_overlapping
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import presets
@@ -26,6 +27,7 @@ from lidar_synth.labels.boxes import (
     turn_boxes,
 )
 from lidar_synth.labels.ground import ground_under
+from lidar_synth.labels.merge import merge_scans
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +111,7 @@ def test_a_bank_survives_the_disk(bank: ObjectBank, tmp_path: Path) -> None:
         and again.sensor == bank.sensor
         and again.boxes.names == bank.boxes.names
     )
-    for name in ("scan", "number", "ground", "start", "points", "reflectance", "label"):
+    for name in {f.name for f in fields(bank)} - {"sensor", "boxes"}:
         a = getattr(again, name)
         b = getattr(bank, name)
         assert a.dtype == b.dtype and np.array_equal(a, b)
@@ -120,7 +122,7 @@ def test_a_bank_survives_the_disk(bank: ObjectBank, tmp_path: Path) -> None:
     for name in ("cut", "other"):
         with pytest.raises(
             DataError,
-            match=rf"{name}\.npz.*a bank of objects \(lidar-synth-objects/1\)",
+            match=rf"{name}\.npz.*a bank of objects \(lidar-synth-objects/2\)",
         ):
             ObjectBank.load(tmp_path / f"{name}.npz")
     with pytest.raises(FileError, match="nowhere"):
@@ -129,6 +131,26 @@ def test_a_bank_survives_the_disk(bank: ObjectBank, tmp_path: Path) -> None:
         replace(bank, label=bank.label[1:])
     with pytest.raises(IndexError, match=f"object {len(bank)} of"):
         bank[len(bank)]
+
+
+def test_a_bank_of_version_1_has_no_rings(bank: ObjectBank, tmp_path: Path) -> None:
+    bank.save(tmp_path / "objects.npz")
+    arrays = dict(np.load(tmp_path / "objects.npz"))
+    del arrays["ring"]
+    arrays["format"] = np.array("lidar-synth-objects/1")
+    np.savez(tmp_path / "objects.npz", **arrays)
+    old = ObjectBank.load(tmp_path / "objects.npz")
+    assert old == replace(bank, ring=None) != bank and old[0].scan.ring is None
+
+
+def test_a_raised_object_is_seen_by_the_lasers_of_its_new_place() -> None:
+    scan = cast([car(9, 3)])
+    [found] = objects_of(replace(scan, ring=assign_beams(scan).ring)).values()
+    host = cast(ground=0.4 - HEIGHT)
+    host.ring = assign_beams(host).ring
+    pasted = paste(host, [found])
+    assert (pasted.instance == 1).sum() > 50
+    assert np.array_equal(pasted.ring, assign_beams(pasted).ring)
 
 
 def test_a_bank_needs_boxes_and_one_sensor() -> None:
@@ -158,12 +180,20 @@ def test_without_instances_an_object_is_what_stands_in_its_box() -> None:
     assert (found.scan.label == IGNORE).all()
 
 
-def test_instances_serve_where_there_are_no_boxes() -> None:
+@pytest.mark.parametrize("by_class", [False, True])
+def test_instances_serve_where_there_are_no_boxes(by_class: bool) -> None:
+    """A parked car and a moving one may both be number 1 in a file of SemanticKITTI."""
     scan = replace(cast([car(9, 3), car(14, -5), car(40, 20)]), boxes=None)
+    sizes = [(scan.instance == i).sum() for i in (1, 2, 3)]
+    if by_class:
+        moving = np.where(scan.instance == 2, 252, SEMANTIC_KITTI.encode(scan.label))
+        scan.instance[scan.instance == 2] = 1
+        raw = moving.astype(np.uint32) | scan.instance.astype(np.uint32) << 16
+        scan.raw_label = raw
     found = instances_of(scan, least=20)
-    assert [len(o.scan) for o in found] == [
-        (scan.instance == i).sum() for i in (1, 2, 3)
-    ]
+    assert sorted(len(o.scan) for o in found) == sorted(sizes)
+    _, counts = np.unique(merge_scans(cast(), [scan]).instance, return_counts=True)
+    assert sorted(counts[1:]) == sorted(sizes)
     pasted = paste(cast(), [o.turned(1.0) for o in found])
     assert pasted.boxes is not None and len(pasted.boxes) == 3
     assert_nothing_shares_a_ray(pasted, 1)

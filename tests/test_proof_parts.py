@@ -36,6 +36,7 @@ from lidar_synth.lab.proof.drawing import ticks
 from lidar_synth.lab.proof.places import APART, SPLITS, choose, clusters, find_places
 from lidar_synth.lab.proof.plan import describe as describe_plan
 from lidar_synth.lab.proof.planning import make_plan
+from lidar_synth.lab.proof.pools import read_pool
 from lidar_synth.lab.proof.scores import (
     FEWEST_PLACES,
     GROUPS,
@@ -276,12 +277,25 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
     assert 0.91 <= held / count <= 0.99
 
 
+def test_intervals_hold_the_truth_where_one_training_is_tested_in_all_places() -> None:
+    """What a seed adds is then the same in all places."""
+    rng = np.random.default_rng(0)
+    held = 0
+    count = 400
+    for trial in range(count):
+        d = 2 + rng.normal(0, 1, (8, 1)) + rng.normal(0, 1, (1, 5))
+        low, high = interval(d, seed=trial, draws=800, shared=True)  # type: ignore[misc]
+        held += low <= 2 <= high
+    assert 0.91 <= held / count <= 0.99
+
+
 def test_too_few_places_have_no_interval_and_missing_seeds_do_not_count() -> None:
     d = np.random.default_rng(0).normal(size=(FEWEST_PLACES, 2))
     assert interval(d[1:]) is None
     d[0, 1] = np.nan
-    low, high = interval(d)  # type: ignore[misc]
-    assert low < np.nanmean(d) < high
+    for shared in (False, True):
+        low, high = interval(d, shared=shared)  # type: ignore[misc]
+        assert low < np.nanmean(d) < high
 
 
 def test_ticks_are_round_and_few() -> None:
@@ -315,6 +329,15 @@ def test_a_plan_is_paired_and_tests_on_places_left_out() -> None:
         } <= set(scans)
         assert not set(plan.skin_scans(place)) & set(plan.places[place])
     assert all(scan.sensor.columns == 64 for scan in scans.values())
+
+
+def test_a_plan_says_how_many_labelled_scans_each_training_gets() -> None:
+    names = [f"00/{frame:06d}" for frame in range(6)]
+    source = Scans([*names, "01/000000", "02/000000"])
+    plan, _ = make_plan(source, SMALL, None, 1)
+    assert "each training gets 2 to 7 labelled scans" in describe_plan(plan)
+    plan, _ = make_plan(source, replace(SMALL, labelled=1), None, 1)
+    assert "each training gets 1 labelled scan and" in describe_plan(plan)
 
 
 def test_scans_of_other_places_are_tested_by_one_training_for_each_seed() -> None:
@@ -483,6 +506,27 @@ def test_a_command_trains_on_the_mixture_of_its_file(name: str, tmp_path: Path) 
         table = tables[place]
         assert table.sum() == (label != 255).sum() == table[:, road].sum()
         assert table[road, road] == (label == road).sum()
+
+
+def test_a_command_gets_the_pools_that_its_training_changed(tmp_path: Path) -> None:
+    """Such as generated scans with the reflectance of the labelled ones."""
+    task = job("pretrain-generator", tmp_path)
+    pool = [
+        replace(scan, reflectance=scan.reflectance / 2)
+        for scan in task.pools["generator"]
+    ]
+    task = replace(task, pools={"generator": pool}, pool_folders={})
+    command = shlex.join([sys.executable, "-c", FAILING["one prediction"][0], "{job}"])
+    with pytest.raises(DataError, match="with 1 predictions"):
+        CommandTrainer(command)(task)
+    values = yaml.safe_load((task.folder / "job.yaml").read_text())
+    read = read_pool(Path(values["stages"][0]["synthetic"]))
+    assert [
+        np.array_equal(*pair)
+        for pair in zip(
+            (s.reflectance for s in read), (s.reflectance for s in pool), strict=True
+        )
+    ] == [True] * len(pool)
 
 
 def test_scans_without_instances_exchange_parts_without_whole_objects(

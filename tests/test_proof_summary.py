@@ -2,6 +2,7 @@
 other places."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,13 +10,14 @@ import pytest
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.lab.proof.arms import rows
+from lidar_synth.lab.proof.arms import Row, rows
 from lidar_synth.lab.proof.page import body
 from lidar_synth.lab.proof.plan import ProofPlan
 from lidar_synth.lab.proof.scores import groups_of
 from lidar_synth.lab.proof.settings import ProofSettings
 from lidar_synth.lab.proof.summary import summarise
 from lidar_synth.lab.proof.trial import TrialOutcome
+from lidar_synth.lab.town.returns import CALIBRATED_ON
 
 PERSON = TRAIN_ID["person"]
 ROAD = TRAIN_ID["road"]
@@ -33,12 +35,9 @@ def outcome(found: int, persons: int) -> TrialOutcome:
     return TrialOutcome(table)
 
 
-@pytest.mark.filterwarnings("ignore:Mean of empty slice")
-def test_a_place_without_the_scored_class_does_not_count() -> None:
-    arms = rows(tuple(FOUND), (0.5,))
-    names = [f"p{i}" for i in range(7)]
-    pairs = [(name, 0) for name in names]
-    plan = ProofPlan(
+def a_plan(arms: list[Row], names: list[str], seeds: int = 1) -> ProofPlan:
+    pairs = [(name, seed) for seed in range(seeds) for name in names]
+    return ProofPlan(
         ProofSettings(only=("person",)),
         {n: [i] for i, n in enumerate(names)},
         tuple(names),
@@ -58,6 +57,13 @@ def test_a_place_without_the_scored_class_does_not_count() -> None:
         1.0,
         1,
     )
+
+
+@pytest.mark.filterwarnings("ignore:Mean of empty slice")
+def test_a_place_without_the_scored_class_does_not_count() -> None:
+    arms = rows(tuple(FOUND), (0.5,))
+    names = [f"p{i}" for i in range(7)]
+    plan = a_plan(arms, names)
     found = {
         (n, 0): {
             arm: outcome(FOUND[arm.name], 0 if n == "p6" else 1000) for arm in arms
@@ -69,10 +75,43 @@ def test_a_place_without_the_scored_class_does_not_count() -> None:
     assert by_key["pretrain"]["better_in"] == "6 of 6 places"
     assert by_key["pretrain"]["difference"] == pytest.approx(30)
     assert by_key["pretrain"]["by_place"]["p6"] is None
-    assert by_key["pretrain"]["budget"].startswith("1 labelled scans; ")
-    assert by_key["alone"]["budget"].startswith("1 unlabelled scans; ")
+    assert by_key["pretrain"]["budget"].startswith("1 labelled scan; ")
+    assert by_key["alone"]["budget"].startswith("1 unlabelled scan; ")
     chosen = values["chosen_elsewhere"]
     assert chosen["arms"] == ["pretrain"] * 7 and chosen["difference"] == pytest.approx(
         30
     )
     assert "NaN" not in json.dumps(values) and "nan" not in body(values)
+
+
+def test_one_training_in_all_places_has_wider_intervals_and_says_why() -> None:
+    arms = rows(("exchange",), (0.5,))
+    names = [f"p{i}" for i in range(6)]
+    seeds = [100, 300, 500]
+    apart = a_plan(arms, names, len(seeds))
+    found = {
+        (n, seed): {
+            arm: outcome(gain if arm.name == "exchange" else 300, 1000) for arm in arms
+        }
+        for n in names
+        for seed, gain in enumerate(seeds)
+    }
+    widths = []
+    for plan in (apart, replace(apart, training={"town": [0]})):
+        values = summarise(plan, found, {}, "reference").values
+        low, high = values["arms"][1]["interval"]
+        widths.append(high - low)
+        told = any("over 3 seeds is too narrow" in text for text in values["limits"])
+        assert told == (plan.training is not None)
+    assert widths[1] > 1.5 * widths[0]
+
+
+@pytest.mark.parametrize("seen", ["town seed 0", f"town seed 0 ({CALIBRATED_ON})"])
+def test_what_the_town_owes_to_real_labels_is_named_once(seen: str) -> None:
+    arms = rows(("recipe", "town"), (0.5,))
+    names = ["p0", "p1"]
+    found = {(n, 0): {arm: outcome(300, 1000) for arm in arms} for n in names}
+    proof = summarise(a_plan(arms, names), found, {}, "reference", seen)
+    for row in proof.values["arms"][1:]:
+        assert row["budget"].count(CALIBRATED_ON) == 1
+        assert "labels of the town, which cost nothing" in row["budget"]

@@ -4,10 +4,12 @@ read."""
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from py123d_files import (
+    MOUNT,
     TO_NUSCENES,
     copy_logs,
     grey,
@@ -19,7 +21,7 @@ from py123d_files import (
 
 from lidar_synth.datasets.classes import IGNORE, NUSCENES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.formats import READERS, open_scans
+from lidar_synth.formats import READERS, open_scans, py123d
 from lidar_synth.geometry.scan import Scan
 
 CODECS = ["laz", "draco", "ipc", "ipc_zstd"]
@@ -75,6 +77,23 @@ def check_boxes(read: Scan, sent: Scan) -> None:
 def test_what_py123d_wrote_is_read(tmp_path: Path, town: list[Scan]) -> None:
     pytest.importorskip("pyarrow")
     copy_logs(tmp_path)
+    check(tmp_path, town)
+
+
+def test_firings_without_a_return_are_dropped_as_in_nuscenes(
+    tmp_path: Path, town: list[Scan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyarrow")
+    copy_logs(tmp_path)
+    read_cloud = py123d._cloud
+
+    def with_empty_firings(*given: Any) -> dict[str, np.ndarray]:
+        cloud = read_cloud(*given)
+        empty = {name: values[-100:] for name, values in cloud.items()}
+        empty["xyz"] = np.tile(MOUNT[:3], (100, 1))  # the sensor's place in the vehicle
+        return {n: np.concatenate([values, empty[n]]) for n, values in cloud.items()}
+
+    monkeypatch.setattr(py123d, "_cloud", with_empty_firings)
     check(tmp_path, town)
 
 

@@ -136,6 +136,13 @@ def test_bad_input_is_refused(scans: list[Scan]) -> None:
         count_points(scans[0], np.zeros(3, int))
     with pytest.raises(DataError, match="type float64"):
         count_points(scans[0], np.zeros(len(scans[0])))
+    with pytest.raises(DataError, match="none is right.*expected train ids, 0 to 18"):
+        stress(
+            scans,
+            lambda s, _: sum(count_points(x, np.full(len(x), 40)) for x in s),
+            LOSSES,
+            progress=False,
+        )
     with pytest.raises(ConfigError, match="fog"):
         cases(["fogg"])
     with pytest.raises(DataError, match="without labels"):

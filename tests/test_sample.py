@@ -106,6 +106,23 @@ def test_sample_takes_another_format_after_one_that_cannot_hold_the_scans(
     assert (tmp_path / "out" / NOTE).is_file()
 
 
+def test_sample_refuses_a_folder_that_holds_samples_of_another_layout(
+    tmp_path: Path,
+) -> None:
+    from lidar_synth.cli import app
+
+    model = write(tmp_path / "laid.safetensors", dropout=0.1, condition="layout")
+    layout = tmp_path / "street.yaml"
+    call = ["sample", str(tmp_path / "out"), "--model", str(model), "--count", "1"]
+    call += ["--objects", "drawn", "--condition", str(layout)]
+    layout.write_text("objects: [{class: Car, at: [8, 2]}]")
+    assert CliRunner().invoke(app, call).exception is None
+    assert "0 scans written" in CliRunner().invoke(app, call).output
+    layout.write_text("objects: [{class: Car, at: [12, 2]}]")
+    with pytest.raises(ConfigError, match="was filled with {'conditions'"):
+        CliRunner().invoke(app, call, catch_exceptions=False)
+
+
 @pytest.mark.slow
 def test_sample_takes_its_conditions_from_a_dataset(tmp_path: Path) -> None:
     from lidar_synth.cli import app

@@ -181,8 +181,8 @@ def test_what_only_the_laboratory_imports_is_part_of_it() -> None:
 
 
 LIMITS = {
-    "plugin": (168_100, 5.95, 130),
-    "laboratory": (138_200, 6.01, 130),
+    "plugin": (168_850, 5.95, 130),
+    "laboratory": (138_400, 6.01, 130),
     "tools": (39_914, 5.8, 130),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when

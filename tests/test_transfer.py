@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 from lidar_synth import Town
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
 from lidar_synth.geometry.transfer import Measurement, Mount, Response, SeenAs, Transfer
 from lidar_synth.geometry.transfer.rays import rays_of
@@ -244,6 +244,26 @@ def test_boxes_and_pose_move_to_the_targets_frame(scan: Scan, mount: str) -> Non
     )
     world = found.points.astype(float) @ found.pose[:3, :3].T + found.pose[:3, 3]
     assert np.median(np.abs(world[found.label == ROAD, 2] - GROUND)) < 0.01
+
+
+@pytest.mark.parametrize(
+    "transfer",
+    [
+        Transfer(replace(HDL64E, range_max=20.0)),
+        casting(replace(HDL64E, range_max=20.0)),
+        casting(UNEVEN, Mount(0.3)),
+    ],
+    ids=["kept", "cast", "other lasers"],
+)
+def test_boxes_without_a_return_are_left_out(scan: Scan, transfer: Transfer) -> None:
+    far = np.float32([60, 30, 0, 0, 0, 0, 0])
+    boxes = replace(
+        Boxes(np.float32([CAR_BOX, CAR_BOX + far]), ("Car", "Van")),
+        dont_care=np.ones((1, 4)),
+    )
+    given = replace(scan, boxes=boxes)
+    for found in (transfer(given), transfer.cast(given).scan):
+        assert found.boxes.names == ("Car",) and len(found.boxes.dont_care) == 1
 
 
 def test_porous_surfaces_keep_their_share_of_returns() -> None:

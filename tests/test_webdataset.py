@@ -14,7 +14,7 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WebDataset, open_scans
 from lidar_synth.formats.convert import SETTINGS, Report, convert
-from lidar_synth.formats.webdataset import WebDatasetWriter
+from lidar_synth.formats.webdataset import WebDatasetWriter, _write_tar
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.evaluate.extractors.archive import Archive
 
@@ -79,6 +79,29 @@ def test_members_are_what_webdataset_decodes(tmp_path: Path) -> None:
     )
     assert np.array_equal(read[4].pose, scans[4].pose) and read[1].pose is None
     assert len(open_scans(tmp_path / "scans-000002.tar")) == 1
+
+
+def test_boxes_of_earlier_versions_are_read(tmp_path: Path) -> None:
+    """They have values and names only."""
+    [path, *_] = write_tars(tmp_path)
+    [[key, members]] = samples(path).items()
+    facts = json.loads(members["json"])
+    del facts["boxes"]
+    members["json"] = json.dumps(facts).encode()
+    named = ((f"{key}.{kind}", content) for kind, content in members.items())
+    with path.open("wb") as file:
+        _write_tar(file, named)
+    read = open_scans(path)[0].boxes
+    sent = some_scan(0).boxes
+    assert read is not None and sent is not None and read.names == sent.names
+    assert np.array_equal(read.values, sent.values) and (read.instance == -1).all()
+    facts["boxes"] = {"occlusion": [10**400] * len(read)}
+    members["json"] = json.dumps(facts).encode()
+    named = ((f"{key}.{kind}", content) for kind, content in members.items())
+    with path.open("wb") as file:
+        _write_tar(file, named)
+    with pytest.raises(DataError, match="the members that this package writes"):
+        open_scans(path)[0]
 
 
 def test_a_bank_goes_out_under_its_names(tmp_path: Path) -> None:

@@ -60,9 +60,10 @@ def check_mix(
     if out is not None:
         view_suffix(out)
     source = open_scans(real, sensor=sensor)
-    mixture = make_mixture(
-        len(source), read_settings(mix) | {"ratio": 0.5}, lambda scan, rng: scan
-    )
+    settings = read_settings(mix) | {"ratio": 0.5}
+    # Ids of the trainer's files; here both kinds have train ids.
+    settings.pop("classes", None)
+    mixture = make_mixture(len(source), settings, lambda scan, rng: scan, weighs=True)
     chosen = [i for i in range(len(mixture)) if mixture.domain(i)][:count]
     kinds: list[list[Scan]] = [
         [source[i] for i in spread(len(source), count)],

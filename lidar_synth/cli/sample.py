@@ -95,7 +95,7 @@ def sample(
     """
     import torch
 
-    from lidar_synth.bake.conditions import conditions_for, settle_objects
+    from lidar_synth.bake.conditions import conditions_for, fingerprint, settle_objects
     from lidar_synth.errors import choose
     from lidar_synth.files.claims import hold_claim
     from lidar_synth.formats import WRITERS
@@ -126,6 +126,7 @@ def sample(
         "condition": condition,
         "condition_layout": condition_layout,
         "condition_split": condition_split,
+        "conditions": fingerprint(given),
         "columns": columns,
         "objects": chosen,
         "trained_on": provenance["data"],

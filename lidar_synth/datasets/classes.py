@@ -210,6 +210,9 @@ SEMANTIC_KITTI = Taxonomy(
 """SemanticKITTI's ids: ``learning_map`` of semantic-kitti.yaml and its inverse to the static
 classes."""
 
+MAX_INSTANCES = 1000
+"""An instance of KITTI-360 is id * 1000 + n, as in the dataset's label images and tools."""
+
 KITTI360 = Taxonomy(
     "KITTI-360",
     _by_name(

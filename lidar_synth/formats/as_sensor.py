@@ -20,9 +20,6 @@ from lidar_synth.geometry.transfer import (
 )
 from lidar_synth.noise import keyed_rng
 
-_SURFACE = 0.1  # metres that returns stick out of their box
-_FLOOR = 0.1  # metres above a box's bottom, below which a return is the road's
-
 
 @dataclass(frozen=True)
 class AsSensor:
@@ -49,8 +46,6 @@ class AsSensor:
     def cast(self, scan: Scan, source: Source, index: int) -> Transferred:
         """The scan at ``index`` of a source, which has been read; its noise depends on the index.
 
-        Boxes in which the other sensor has no return are left out.
-
         Raises:
             DataError, FileError: as ``Transfer.cast``; also if a neighbouring sweep cannot be read.
         """
@@ -58,13 +53,7 @@ class AsSensor:
             source.load(i) if isinstance(source, ScanFiles) else source[i]
             for i in self._around(source, index)
         ]
-        cast, seen = self.transfer.cast(scan, keyed_rng(0, index), others)
-        if cast.boxes is not None:
-            held = cast.boxes.enlarged(_SURFACE).contain(
-                cast.points, above_floor=_FLOOR + _SURFACE
-            )
-            cast.boxes = cast.boxes[held.any(axis=1)]
-        return Transferred(cast, seen)
+        return self.transfer.cast(scan, keyed_rng(0, index), others)
 
     def _around(self, source: Source, index: int) -> list[int]:
         """The scans of the same sequence around a scan, without it."""

@@ -235,10 +235,13 @@ def write_boxes(path: Path, boxes: Boxes | None) -> None:
         FileError: if they cannot be written.
     """
     if boxes is not None:
-        values = {
-            f.name: np.asarray(getattr(boxes, f.name)).tolist() for f in fields(Boxes)
-        }
-        write_file(path.with_suffix(BOXES), json.dumps(values).encode())
+        values = json.dumps(boxes_as_lists(boxes))
+        write_file(path.with_suffix(BOXES), values.encode())
+
+
+def boxes_as_lists(boxes: Boxes) -> dict[str, list[Any]]:
+    """The fields of boxes by their names, as JSON holds them."""
+    return {f.name: np.asarray(getattr(boxes, f.name)).tolist() for f in fields(Boxes)}
 
 
 def drop_empty_firings(scan: Scan) -> Scan:

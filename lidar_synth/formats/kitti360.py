@@ -34,12 +34,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import KITTI360 as CLASSES
+from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.datasets.recordings import KITTI360_SPLITS
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import list_files, read_file, read_values
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti360_boxes import (
-    MAX_INSTANCES,
     MOST_INSTANCE,
     WorldBoxes,
     read_boxes,

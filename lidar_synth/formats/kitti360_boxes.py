@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import numbers, unreadable, write_file
 from lidar_synth.geometry.scan import FARTHEST, Boxes
@@ -60,9 +61,6 @@ BY_NAME = {
     "Misc": 36,
 }
 """{KITTI's name: semanticId to write}. Lossy: vans become cars, and sitting persons pedestrians."""
-
-MAX_INSTANCES = 1000
-"""A ``Boxes``' instance is id * 1000 + instanceId, as in the dataset's label images and tools."""
 
 MOST_INSTANCE = (1 << 31) - 1 - 100 * MAX_INSTANCES
 """Maximum instance of a box to write: the reader adds its class to it."""

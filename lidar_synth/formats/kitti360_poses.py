@@ -2,9 +2,9 @@
 
 Files (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
 
-    calibration/perspective.txt         P_rect_00, R_rect_00, S_rect_00
+    calibration/perspective.txt         P_rect_00, R_rect_00, S_rect_00, and _01 of camera 1
     calibration/calib_cam_to_velo.txt   12 numbers: camera 0, unrectified, to velodyne
-    calibration/calib_cam_to_pose.txt   image_00: camera 0, unrectified, to IMU
+    calibration/calib_cam_to_pose.txt   image_00: camera 0, unrectified, to IMU; image_01 .. 03
     data_poses/DRIVE/poses.txt          a frame and 12 numbers per line: IMU to world
     data_poses/DRIVE/cam0_to_world.txt  a frame and 16 numbers per line: rectified camera 0 to world
 """
@@ -49,7 +49,7 @@ SIZES = {
     "image_00": 12,
     "cam_to_velo": 12,
 }
-"""Number of values of each matrix of the calibration."""
+"""Number of values of each matrix of the calibration that is required."""
 
 
 def read_calibration(root: Path) -> Calibration | None:
@@ -69,14 +69,13 @@ def read_calibration(root: Path) -> Calibration | None:
     ]
     if not all(path.is_file() for path in paths):
         return None
-    found = read_named_matrices(paths[0]) | read_named_matrices(paths[2])
-    found["cam_to_velo"] = read_matrix(paths[1], 12).reshape(-1)
+    matrices = read_named_matrices(paths[0]) | read_named_matrices(paths[2])
+    matrices["cam_to_velo"] = read_matrix(paths[1], 12).reshape(-1)
     try:
-        matrices = {name: found[name] for name in SIZES}
         if wrong := {
-            name: values.size
-            for name, values in matrices.items()
-            if values.size != SIZES[name]
+            name: matrices[name].size
+            for name, size in SIZES.items()
+            if matrices[name].size != size
         }:
             raise ValueError(f"{wrong} values, not {SIZES}")
         for name in ("image_00", "cam_to_velo"):
@@ -97,31 +96,31 @@ def read_calibration(root: Path) -> Calibration | None:
 
 def write_calibration(root: Path, camera: Calibration) -> None:
     """The inverse of ``read_calibration``: KITTI-360's own matrices unchanged; other cameras as
-    unrectified."""
-    matrices = camera.matrices
-    if not {"P_rect_00", "R_rect_00", "S_rect_00", "image_00", "cam_to_velo"} <= set(
-        matrices
-    ):
-        matrices = {
-            "P_rect_00": camera.projection,
-            "R_rect_00": np.eye(3),
+    unrectified.
+
+    The dataset's own tools require all of its cameras: those that are not known are camera 0.
+    """
+    own = camera.matrices
+    if not SIZES.keys() <= own.keys():
+        own = {
             "S_rect_00": np.array(camera.image_size or CAMERA.image_size, np.float64),
+            "R_rect_00": np.eye(3),
+            "P_rect_00": camera.projection,
             "image_00": (IMU_FROM_SENSOR @ camera.sensor_from_camera)[:3],
             "cam_to_velo": camera.sensor_from_camera[:3],
         }
+    names = [f"{kind}_rect_0{k}" for k in range(2) for kind in "SRP"]
+    names += [f"image_0{k}" for k in range(4)]
+    matrices = {name: own[f"{name[:-1]}0"] for name in names} | dict(own)
     folder = root / "calibration"
     write_file(
         folder / "calib_cam_to_velo.txt",
-        f"{numbers(matrices['cam_to_velo'].ravel())}\n".encode(),
+        f"{numbers(matrices.pop('cam_to_velo').ravel())}\n".encode(),
     )
-    write_named_matrices(
-        folder / "calib_cam_to_pose.txt", {"image_00": matrices["image_00"]}
-    )
+    mounts = {n: matrices.pop(n) for n in list(matrices) if n.startswith("image_")}
+    write_named_matrices(folder / "calib_cam_to_pose.txt", mounts)
     # Last, because its presence marks the calibration as complete.
-    write_named_matrices(
-        folder / "perspective.txt",
-        {n: matrices[n] for n in ("S_rect_00", "R_rect_00", "P_rect_00")},
-    )
+    write_named_matrices(folder / "perspective.txt", matrices)
 
 
 def imu_from_sensor(camera: Calibration | None) -> NDArray[np.float64]:

@@ -13,7 +13,6 @@ Layout (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme):
 """
 
 import re
-from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -30,15 +29,11 @@ from lidar_synth.files.disk import (
     write_file,
     write_named_matrices,
 )
-from lidar_synth.formats.calibration import (
-    Calibration,
-    homogeneous,
-    ideal_camera,
-    in_view,
-)
+from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
+from lidar_synth.formats.camera_boxes import IMAGE_SIZE, CameraBoxes
 from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
 from lidar_synth.formats.points import read_points
-from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.formats.source import OnBad
 from lidar_synth.formats.writer import Picture, Writer, write_image
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -54,12 +49,12 @@ SPLITS: dict[str, tuple[Part, ...]] = {
 }
 """{split: folders}; ``ImageSets`` lists the frames."""
 
-OBJECT_CAMERA = ideal_camera(721.5377, (1242, 375))
+OBJECT_CAMERA = ideal_camera(721.5377, IMAGE_SIZE)
 """The camera that is written if none is known: KITTI's image size and focal length, at the
 sensor."""
 
 
-class KITTIObject(ScanFiles):
+class KITTIObject(CameraBoxes):
     """KITTI's object set: <root>/training and testing with velodyne, label_2, calib, image_2, and
     ImageSets.
 
@@ -106,7 +101,6 @@ class KITTIObject(ScanFiles):
     ) -> None:
         root = Path(root)
         self._velodyne = "velodyne_reduced" if reduced else "velodyne"
-        self._cropped = False
         parts = choose("KITTI object split", split, SPLITS)
         image_set = root / "ImageSets" / f"{split}.txt"
         if split != "all" and image_set.is_file():
@@ -126,27 +120,13 @@ class KITTIObject(ScanFiles):
             ]
         super().__init__(root, ids, sensor, on_bad)
 
-    def with_boxes(self) -> "KITTIObject":
-        """The scans with boxes, cropped to the view of camera 2: KITTI has boxes nowhere else, so
-        that a detector would learn that objects outside of the view are background.
-
-        Raises:
-            DataError: if no scan has boxes.
-        """
-        ids = [
-            name for name in self.ids if self._file(name, "label_2", ".txt").is_file()
-        ]
-        if not ids:
-            raise DataError(f"{self.root} without boxes", "training/label_2")
-        part = copy(self)
-        part.ids = tuple(ids)
-        part._cropped = True
-        return part
-
     @property
     def beyond_view(self) -> bool:
-        """Whether its scans have points outside of the camera's view, where KITTI has no boxes."""
-        return not self._cropped and self._velodyne == "velodyne"
+        """See ``CameraBoxes.beyond_view``."""
+        return super().beyond_view and self._velodyne == "velodyne"
+
+    def _has_boxes(self, name: str) -> bool:
+        return self._file(name, "label_2", ".txt").is_file()
 
     @property
     def drives(self) -> tuple[str, ...] | None:
@@ -195,17 +175,11 @@ class KITTIObject(ScanFiles):
             image_path=image if image.is_file() else None,
             id=name,
         )
-        if not self._cropped:
-            return scan
-        camera = self.calibration(index)
-        assert camera is not None  # boxes are read with it
-        size = camera.image_size or OBJECT_CAMERA.image_size
-        return in_view(scan, replace(camera, image_size=size))
+        return self._in_view(scan, index)
 
     @property
     def options(self) -> dict[str, Any]:
-        own = {"velodyne": self._velodyne}
-        return own | {"cropped": True} if self._cropped else own
+        return {"velodyne": self._velodyne} | super().options
 
     def calibration(self, index: int) -> Calibration | None:
         name = self.ids[index]
@@ -270,7 +244,7 @@ class KITTIObjectWriter(Writer):
             )
         camera = camera or OBJECT_CAMERA
         if picture is None:
-            width, height = camera.image_size or (1242, 375)
+            width, height = camera.image_size or IMAGE_SIZE
             picture = np.zeros((height, width, 3), np.uint8)
         image = folder / "image_2" / f"{frame}.png"
         write_image(image, picture)

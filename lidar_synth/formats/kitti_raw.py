@@ -27,19 +27,23 @@ from lidar_synth.files.disk import (
     read_named_matrices,
 )
 from lidar_synth.formats.calibration import Calibration, homogeneous, read_image_size
+from lidar_synth.formats.camera_boxes import CameraBoxes
 from lidar_synth.formats.points import read_points
-from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.formats.source import OnBad
 from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan, wrap_angle
 from lidar_synth.geometry.sensor import Sensor
 
 DRIVES = "*_drive_*/velodyne_points/data"
 """Pattern of the folders with scans, relative to the folder of a date."""
 
+KITTI360 = "2013_05_28_drive_"
+"""Begins the names of KITTI-360's drives, whose folders are like those of KITTI raw."""
+
 _IN_NAMES = str.maketrans(" ", "_", "()")
 """Turns a class of KITTI raw, such as "Person (sitting)", into KITTI's name of it."""
 
 
-class KITTIRaw(ScanFiles):
+class KITTIRaw(CameraBoxes):
     """KITTI's raw drives: <root>/[DATE/]DATE_drive_NNNN_sync/velodyne_points/data/*.bin,
     tracklet_labels.xml.
 
@@ -53,7 +57,7 @@ class KITTIRaw(ScanFiles):
         on_bad: see ``ScanFiles``.
 
     Raises:
-        DataError: if the folder has no drive.
+        DataError: if the folder has no drive, or drives of KITTI-360.
 
     Example:
         >>> from lidar_synth import KITTIRaw
@@ -87,6 +91,12 @@ class KITTIRaw(ScanFiles):
             for p in sorted(root.glob(pattern))
         ]
         self._drives = {drive.resolve().name: drive for drive in found}
+        if any(name.startswith(KITTI360) for name in self._drives):
+            raise DataError(
+                f"{root} has drives of KITTI-360",
+                "drives of KITTI raw",
+                "Give the folder that holds data_3d_raw, the folder of KITTI-360's drives.",
+            )
         ids = [
             f"{name}/{path.stem}"
             for name, drive in self._drives.items()
@@ -107,7 +117,7 @@ class KITTIRaw(ScanFiles):
         found = None
         if boxes is not None and frame.isdecimal():
             found = boxes.get(int(frame), Boxes(np.zeros((0, 7), np.float32), ()))
-        return Scan(
+        scan = Scan(
             points[:, :3],
             points[:, 3],
             self.sensor,
@@ -115,6 +125,11 @@ class KITTIRaw(ScanFiles):
             image_path=image if image.is_file() else None,
             id=self.ids[index],
         )
+        return self._in_view(scan, index)
+
+    def _has_boxes(self, name: str) -> bool:
+        drive = self._drives[name.split("/")[0]]
+        return (drive / "tracklet_labels.xml").is_file()
 
     def calibration(self, index: int) -> Calibration | None:
         name, frame = self.ids[index].split("/")

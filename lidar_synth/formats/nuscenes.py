@@ -48,6 +48,8 @@ class NuScenes(ScanFiles):
     """nuScenes' key frames: <root>/samples/LIDAR_TOP/*.pcd.bin, or one such file, with lidarseg's
     labels.
 
+    There is no ``split``: the lists of scenes are in nuScenes' devkit, not in its files.
+
     Args:
         root: the dataset's folder, a folder of ``.pcd.bin`` files, or one file.
         sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says
@@ -113,15 +115,7 @@ class NuScenes(ScanFiles):
             id=self.ids[index],
             **self._read_labels(path, len(points)),
         )
-        # Keeps NaN, which on_bad handles.
-        kept = ~(np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2)
-        if not kept.any():
-            raise DataError(
-                f"{path}: all {len(scan)} points are nearer than {NEAREST:g} m",
-                "a sweep",
-                SKIP_HINT,
-            )
-        return scan[kept]
+        return drop_nearest(scan, path)
 
     def _read_labels(self, sweep: Path, count: int) -> dict[str, Any]:
         """The labels of a sweep's points, if there are any."""
@@ -135,6 +129,23 @@ class NuScenes(ScanFiles):
         return {"label": label, "raw_label": raw.astype(np.uint32)}
 
 
+def drop_nearest(scan: Scan, path: Path) -> Scan:
+    """A sweep of nuScenes without points nearer than ``NEAREST``.
+
+    Raises:
+        DataError: if no point of the file is left.
+    """
+    # Keeps NaN, which on_bad handles.
+    kept = ~(np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2)
+    if not kept.any():
+        raise DataError(
+            f"{path}: all {len(scan)} points are nearer than {NEAREST:g} m",
+            "a sweep",
+            SKIP_HINT,
+        )
+    return scan[kept]
+
+
 def ahead(points: NDArray[np.float32]) -> NDArray[np.float32]:
     """Convert (N, 3) points exactly from nuScenes' x right, y forward to x forward, y left."""
     return np.column_stack([points[:, 1], -points[:, 0], points[:, 2]])
@@ -143,11 +154,17 @@ def ahead(points: NDArray[np.float32]) -> NDArray[np.float32]:
 def lidarseg_files(root: Path) -> Mapping[str, Path]:
     """{name of a sweep: its label file} from the tables of all versions under a dataset's root.
 
+    Versions without ``sample_data.json`` are left out, unless none has it: lidarseg's archive also
+    has the tables of versions that were not downloaded.
+
     Raises:
+        FileError: if no version has ``sample_data.json``.
         DataError: if a table is not JSON, lacks a field, or names a file outside of the root.
     """
     files = {}
-    for table in sorted(root.glob("*/lidarseg.json")):
+    tables = sorted(root.glob("*/lidarseg.json"))
+    complete = [t for t in tables if t.with_name("sample_data.json").is_file()]
+    for table in complete or tables:
         try:
             samples, rows = (
                 _table(table.with_name(name))

@@ -8,7 +8,8 @@ Layout, a folder for each log, each file a table of Arrow with its metadata in M
     SPLIT/LOG/box_detections_se3.arrow  the same of each box, then length, width, height
 
 Clouds are in the frame of the vehicle; the reader gives them in that of the sensor, turned by
-quarters of a circle so that x is ahead. The package reads this layout and does not write it.
+quarters of a circle so that x is ahead, and those of nuScenes without points nearer than one metre
+(``nuscenes.NEAREST``). The package reads this layout and does not write it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,7 +26,7 @@ from lidar_synth.datasets.classes import NUSCENES, PANDASET, WAYMO
 from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthError
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.folder import rows_of_rings
-from lidar_synth.formats.nuscenes import RINGS
+from lidar_synth.formats.nuscenes import RINGS, drop_nearest
 from lidar_synth.formats.points import check_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry.motion import from_world
@@ -189,7 +190,7 @@ class Py123D(ScanFiles):
                 scan.time = (since / 1e6).astype(np.float32)
             if frame.rows.get(BOXES) is not None:
                 scan.boxes = _boxes(*_row(frame, BOXES), scan.pose)
-        return scan
+        return drop_nearest(scan, path) if frame.dataset == "nuscenes" else scan
 
 
 def _frames(folder: Path, dataset: str, table: Any) -> list[tuple[int, Frame]]:

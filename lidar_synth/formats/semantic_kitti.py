@@ -77,7 +77,7 @@ class SemanticKITTI(ScanFiles):
     of a sequence without a ``labels`` folder (the test set) have no labels.
 
     Args:
-        root: the folder that holds ``sequences``.
+        root: the folder that holds ``sequences``, that folder itself, or one sequence.
         split: ``train``, ``val``, ``test`` or ``all``.
         sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says
             (``scans.json``), or else ``hdl64e_semantic_kitti``.
@@ -103,7 +103,11 @@ class SemanticKITTI(ScanFiles):
     @classmethod
     def recognises(cls, root: Path) -> bool:
         """See ``ScanFiles.recognises``."""
-        return any(root.glob("sequences/*/velodyne"))
+        patterns = ("labels/*.label", "calib.txt")
+        found = (p.parent for to in ("velodyne", "*/velodyne") for p in root.glob(to))
+        return any(root.glob("sequences/*/velodyne")) or any(
+            any(folder.glob(pattern)) for folder in found for pattern in patterns
+        )
 
     def __init__(
         self,
@@ -116,7 +120,7 @@ class SemanticKITTI(ScanFiles):
     ) -> None:
         root = Path(root)
         self.taxonomy = taxonomy
-        folders = _find_sequences(root, split)
+        self.folders = folders = _find_sequences(root, split)
         ids = [
             f"{s}/{p.stem}"
             for s, folder in folders.items()
@@ -129,7 +133,7 @@ class SemanticKITTI(ScanFiles):
 
     def read(self, index: int) -> Scan:
         sequence, frame = self.ids[index].split("/")
-        folder = self.root / "sequences" / sequence
+        folder = self.folders[sequence]
         path = folder / "velodyne" / f"{frame}.bin"
         points = read_points(path)
         labels = {}
@@ -230,7 +234,7 @@ class SemanticKITTIWriter(Writer):
                 continue
             self._carried.add(sequence)
             for name in SIDE_FILES:
-                path = source.root / "sequences" / sequence / name
+                path = source.folders[sequence] / name
                 if path.is_file():
                     write_file(
                         self.root / "sequences" / sequence / name, read_file(path)
@@ -268,15 +272,17 @@ class SemanticKITTIWriter(Writer):
 def _find_sequences(root: Path, split: str) -> dict[str, Path]:
     """The folders of a split's sequences by their numbers, in order."""
     wanted = choose("SemanticKITTI split", split, SPLITS)
-    existing = sorted(p.parent.name for p in (root / "sequences").glob("*/velodyne"))
-    found = [s for s in existing if wanted is None or s in wanted]
+    patterns = ("sequences/*/velodyne", "*/velodyne", "velodyne")
+    paths = next(filter(None, (sorted(root.glob(p)) for p in patterns)), [])
+    existing = {p.parent.absolute().name: p.parent for p in paths}
+    found = {s: f for s, f in existing.items() if wanted is None or s in wanted}
     if not found:
         raise DataError(
             f"{root} has no sequence of split {split!r} (it has "
             f"{', '.join(existing) or 'none at all'})",
             "sequences/NN/velodyne/*.bin",
         )
-    return {s: root / "sequences" / s for s in found}
+    return found
 
 
 def read_calibration(folder: Path) -> Calibration | None:

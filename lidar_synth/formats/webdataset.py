@@ -5,8 +5,8 @@ dots and % encoded as %2E and %25::
 
     scans-000000.tar          the first 1000 scans, and so on
       KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml);
-                              if known also provenance, pose (4 x 4, sensor to world) and names of
-                              the boxes
+                              if known also provenance, pose (4 x 4, sensor to world), names of the
+                              boxes, and under "boxes" the other fields of ``Boxes``
       KEY.points.npy          (N, 4) float32: x, y, z in metres, reflectance in [0, 1]
       KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always written, so that samples
                               have the same keys, with "labelled": false in KEY.json if the scan has
@@ -42,6 +42,7 @@ from lidar_synth.files.disk import (
 )
 from lidar_synth.files.parsing import TarMember, parse_json, parse_npy
 from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.folder import boxes_as_lists
 from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -188,14 +189,17 @@ def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
     }
     facts |= {"provenance": dict(scan.provenance)} if scan.provenance else {}
     facts |= {} if scan.pose is None else {"pose": scan.pose.tolist()}
-    facts |= {} if scan.boxes is None else {"names": list(scan.boxes.names)}
     facts |= {} if scan.label is not None else {"labelled": False}
     fields = {"label": np.full(len(scan), IGNORE, np.uint8)} | scan.fields()
     points = np.column_stack([scan.points, fields.pop("reflectance")]).astype(
         np.float32
     )
     arrays = {"points": points, **fields}
-    arrays |= {} if scan.boxes is None else {"boxes": scan.boxes.values}
+    if scan.boxes is not None:
+        arrays["boxes"] = scan.boxes.values
+        other = boxes_as_lists(scan.boxes)
+        del other["values"]
+        facts |= {"names": other.pop("names"), "boxes": other}
     yield f"{key}.json", json.dumps(facts).encode()
     for name, values in arrays.items():
         content = BytesIO()
@@ -218,11 +222,12 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
         if name.endswith(".npy")
     }
     try:
-        boxes = (
-            Boxes(arrays.pop("boxes"), _texts(facts["names"]))
-            if "boxes" in arrays
-            else None
-        )
+        boxes = None
+        if "boxes" in arrays:
+            values = arrays.pop("boxes")
+            other = facts.get("boxes", {})  # earlier versions did not write them
+            with np.errstate(over="ignore"):  # Boxes refuses what is not finite
+                boxes = Boxes(values, _texts(facts["names"]), **other)
         points = arrays.pop("points")
         arrays |= {"points": points[:, :3], "reflectance": points[:, 3]}
         if "labelled" in facts and facts["labelled"] is False:
@@ -238,7 +243,7 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
             for name in ("id", "domain", "pose")
             if name in facts
         }
-    except (ValueError, KeyError, IndexError, TypeError, RecursionError) as error:
+    except (LookupError, OverflowError, RecursionError, TypeError, ValueError) as error:
         raise DataError(
             f"{where}: {error!r}", "the members that this package writes", SKIP_HINT
         ) from error

@@ -39,6 +39,7 @@ def boxes_of(given: Any, count: int) -> list[Boxes] | None:
     if isinstance(given, Mapping):
         given = given.get("layout")
     each = list(given) if isinstance(given, Sequence) else [given] * count
+    each = [one.get("layout") if isinstance(one, Mapping) else one for one in each]
     if not all(
         isinstance(one, Scan | Layout) and one.boxes is not None for one in each
     ):

@@ -379,9 +379,9 @@ def batch_of(
 
     Args:
         name: name of the model's condition.
-        given: a condition for all, or one for each: an array or tensor, a ``Scan`` or ``Layout`` or
-            a sequence of them, or a dictionary with one of these under ``name``, as a bank stores
-            it.
+        given: a condition for all: an array or tensor, a ``Scan`` or ``Layout``; one for each: an
+            array or tensor of B, or a sequence of any of these; or a dictionary with one of these
+            under ``name``, as a bank stores it.
         count: B.
         sensor: the model's sensor.
         shape: shape of one condition.
@@ -403,18 +403,14 @@ def batch_of(
     if isinstance(given, readable):
         # A layout for layouts only.
         given = condition.read(given, sensor, shape, options)  # type: ignore[arg-type]
-    elif (
-        isinstance(given, Sequence)
-        and given
-        and all(isinstance(scan, readable) for scan in given)
-    ):
-        given = np.stack(
-            [condition.read(scan, sensor, shape, options) for scan in given]
+    elif isinstance(given, Sequence) and given and not isinstance(given, str):
+        given = torch.cat(
+            [batch_of(name, one, 1, sensor, shape, options) for one in given]
         )
     if not isinstance(given, Tensor | np.ndarray):
         raise ConfigError(
             f"a condition of type {type(given).__name__}",
-            "an array, a Scan, or a list of Scans",
+            "an array, a Scan, or a list of them",
         )
     values = torch.as_tensor(given)
     if values.is_floating_point() or values.is_complex() or values.dtype == torch.bool:

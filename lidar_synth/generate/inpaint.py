@@ -96,7 +96,7 @@ def check_model(generator: Generator, given: Sensor) -> None:
             "an unconditional model",
             "Use model='town', or no model.",
         )
-    wanted = generator.sensor
+    wanted = generator.header.sensor
     if given.shape != wanted.shape or not np.array_equal(given.edges, wanted.edges):
         raise DataError(
             f"a scan of sensor {given.name!r} ({given.shape[0]} x {given.shape[1]}) for a model of "
@@ -116,14 +116,14 @@ def _batch(
 ) -> list[RangeImage]:
     codec = generator.codec
     device = generator.device
-    known = codec.encode(
-        generator.tensors.from_images([_complete(image) for image in images]).to(device)
-    )
+    images = [_complete(image) for image in images]
+    known = codec.encode(generator.tensors.from_images(images).to(device))
     mask = torch.from_numpy(np.stack(holes)).to(device, torch.float32)[:, None]
     inside = adaptive_max_pool2d(mask, codec.shape[1:]) > 0
     noise = gaussian(seed, indices, codec.shape, device)
+    sensor = generator.header.sensor
     draws = (
-        uniform(seed, indices, (codec.draws, *generator.sensor.shape), device)
+        uniform(seed, indices, (codec.draws, *sensor.shape), device)
         if codec.draws
         else None
     )
@@ -131,7 +131,7 @@ def _batch(
         state = codec.decode(_sample(generator, known, noise, inside, start), draws)
     results = []
     for image, hole, new in zip(
-        images, holes, generator.tensors.to_images(state, generator.sensor), strict=True
+        images, holes, generator.tensors.to_images(state, sensor), strict=True
     ):
         channels = {
             n: np.where(hole, v, image.channels.get(n, v))

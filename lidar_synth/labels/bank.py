@@ -2,7 +2,7 @@
 
 Arrays of the file (numpy's format, never pickled), for M objects with P points in total::
 
-    format                      "lidar-synth-objects/1"
+    format                      "lidar-synth-objects/2"
     sensor                      JSON, the keys of sensors.yaml: the sensor that recorded the objects
     scan                        (M,) text, id of the scan that contains the object
     number                      (M,) int32, index of its box in that scan
@@ -12,6 +12,8 @@ Arrays of the file (numpy's format, never pickled), for M objects with P points 
     start                       (M + 1,) int64, object i has the points start[i] to start[i + 1]
     points                      (P, 3) float32, metres from the box's centre, axes of the sensor
     reflectance, label          (P,) float32 in [0, 1]; (P,) uint8 train ids
+    ring                        (P,) int16, 0 = highest; only if the scans have rings, and not in
+                                version 1
 """
 
 import json
@@ -35,7 +37,10 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import join_boxes
 from lidar_synth.labels.objects import Object, objects_of
 
-FORMAT = "lidar-synth-objects/1"
+FORMAT = "lidar-synth-objects/2"
+
+READABLE = FORMAT, "lidar-synth-objects/1"
+"""Formats that ``load`` reads."""
 
 MOST_BYTES = 1 << 32
 """Maximum size of a bank in memory: a hundred thousand objects of 2,500 points each."""
@@ -71,6 +76,7 @@ class ObjectBank:
     points: NDArray[np.float32]
     reflectance: NDArray[np.float32]
     label: NDArray[np.uint8]
+    ring: NDArray[np.int16] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.boxes)
@@ -94,8 +100,9 @@ class ObjectBank:
             "ground": count,
             "reflectance": total,
             "label": total,
+            "ring": total,
         }.items():
-            if getattr(self, name).shape != (size,):
+            if getattr(self, name) is not None and getattr(self, name).shape != (size,):
                 raise DataError(
                     f"objects: {name} has shape {getattr(self, name).shape}",
                     f"({size},)",
@@ -110,11 +117,12 @@ class ObjectBank:
             "points": "f4",
             "reflectance": "f4",
             "label": "u1",
+            "ring": "i2",
         }
         if wrong := {
-            n: str(getattr(self, n).dtype)
+            n: str(values.dtype)
             for n, kind in types.items()
-            if getattr(self, n).dtype != kind
+            if (values := getattr(self, n)) is not None and values.dtype != kind
         }:
             raise DataError(f"objects: {wrong}", f"{types}")
         for name in ("ground", "points"):
@@ -224,6 +232,7 @@ class ObjectBank:
     def collect(cls, objects: list[tuple[int, Object]]) -> Self:
         """A bank of (number in its scan, object) pairs of one sensor."""
         parts = [o.scan for _, o in objects]
+        rings = [p.ring for p in parts if p.ring is not None]
         return cls(
             sensor=parts[0].sensor,
             boxes=join_boxes([p.boxes for p in parts if p.boxes is not None]),
@@ -238,6 +247,7 @@ class ObjectBank:
                 np.float32
             ),
             label=np.concatenate([p.fields()["label"] for p in parts]),
+            ring=np.concatenate(rings) if len(rings) == len(parts) else None,
         )
 
     @classmethod
@@ -254,7 +264,7 @@ class ObjectBank:
             least, factor = MOST_PACKED
             most = min(least + factor * size, MOST_BYTES)
             arrays: dict[str, Any] = read_arrays(path, most=most)
-            if str(arrays.pop("format")) != FORMAT:
+            if str(arrays.pop("format")) not in READABLE:
                 raise ValueError("another format")
             sensor = Sensor.from_dict(
                 parse_json(str(arrays.pop("sensor")), "its sensor")
@@ -280,7 +290,8 @@ class ObjectBank:
         names = [
             f.name for f in fields(ObjectBank) if f.name not in ("sensor", "boxes")
         ]
-        arrays = {name: getattr(self, name) for name in names}
+        given = {name: getattr(self, name) for name in names}
+        arrays = {n: values for n, values in given.items() if values is not None}
         for f in fields(Boxes):
             arrays[f"box_{f.name}"] = np.asarray(getattr(self.boxes, f.name))
         arrays["format"] = np.array(FORMAT)
@@ -291,8 +302,10 @@ class ObjectBank:
         if not isinstance(other, ObjectBank):
             return NotImplemented
         theirs = other._arrays()
-        ours = self._arrays().items()
-        return all(np.array_equal(values, theirs[name]) for name, values in ours)
+        ours = self._arrays()
+        return ours.keys() == theirs.keys() and all(
+            np.array_equal(values, theirs[name]) for name, values in ours.items()
+        )
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -311,6 +324,7 @@ class ObjectBank:
             self.reflectance[part].copy(),
             self.sensor,
             label=self.label[part].copy(),
+            ring=None if self.ring is None else self.ring[part].copy(),
             boxes=box,
             id=str(self.scan[index]),
         )

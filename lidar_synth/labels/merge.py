@@ -12,7 +12,7 @@ from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import join_boxes
-from lidar_synth.labels.objects import find_returns
+from lidar_synth.labels.objects import find_returns, number_instances
 
 
 def merge_scans(scan: Scan, others: Sequence[Scan]) -> Scan:
@@ -21,8 +21,9 @@ def merge_scans(scan: Scan, others: Sequence[Scan]) -> Scan:
     The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of
     the first scan. Labels, confidence (1 for labels of scans without confidence) and instances
     (those of their boxes, if points have none) are always set; instances of the other scans are
-    renumbered. Rings are set if the first scan has them, as lasers of its sensor; boxes if any scan
-    has them, and so causes; times are dropped, as each scan has its own moment.
+    renumbered, and those of a scan without boxes that has the classes of a file, within which files
+    count. Rings are set if the first scan has them, as lasers of its sensor; boxes if any scan has
+    them, and so causes; times are dropped, as each scan has its own moment.
     """
     parts = [_complete(scan)]
     used = _last_instance(parts[0])
@@ -73,6 +74,8 @@ def _complete(scan: Scan) -> Scan:
         else scan.confidence
     )
     instance = _of_tracks(scan) if scan.instance is None else scan.instance
+    if scan.instance is not None and scan.raw_label is not None and scan.boxes is None:
+        instance = number_instances(scan)  # boxes would lose theirs
     return replace(scan, label=label, confidence=confidence, instance=instance)
 
 

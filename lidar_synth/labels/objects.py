@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,8 @@ class Object(NamedTuple):
     """One object at its recorded position.
 
     Args:
-        scan: its points with reflectance and label, and its one box.
+        scan: its points with reflectance and label, with the class of the file and ring if the
+            recorded scan has them, and its one box.
         ground: height of the ground under it, metres above the sensor's origin.
         cast: ``(boxes, sensor) -> Scan`` makes its returns at another place, as of
             ``ObjectBank.from_town``; without it, the points themselves are moved.
@@ -94,17 +95,31 @@ def instances_of(scan: Scan, least: int = 5) -> list[Object]:
             f"scan {scan.id!r} has no instances",
             "labels and instances, as in SemanticKITTI",
         )
-    things = np.flatnonzero((scan.instance > 0) & (scan.label < THINGS))
-    keys = scan.instance[things].astype(np.int64) * THINGS + scan.label[things]
-    which = np.unique(keys, return_inverse=True)[1]
+    things = np.flatnonzero(scan.label < THINGS)
+    which = number_instances(scan)[things]
     objects = []
     for part in np.split(
-        things[np.argsort(which, kind="stable")], np.cumsum(np.bincount(which))[:-1]
-    ):
+        things[np.argsort(which, kind="stable")], np.cumsum(np.bincount(which))
+    )[1:]:
         if len(part) >= least:
             box = _enclose(scan.points[part])
             objects.append(_object(scan, part, Boxes(box, ("Misc",))))
     return objects
+
+
+def number_instances(scan: Scan) -> NDArray[np.int32]:
+    """(N,) the instances of a scan as 1, 2, ..., 0 = none.
+
+    Files count instances within each of their classes: a parked car and a moving one of
+    SemanticKITTI may both have number 1. Without their classes, those of the labels are used.
+    """
+    assert scan.instance is not None
+    kind: Any = scan.label if scan.raw_label is None else scan.raw_label
+    there = np.flatnonzero(scan.instance > 0)
+    keys = scan.instance[there].astype(np.int64) << 32 | kind[there]
+    numbers = np.zeros(len(scan), np.int32)
+    numbers[there] = np.unique(keys, return_inverse=True)[1] + 1
+    return numbers
 
 
 def _enclose(points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -173,6 +188,7 @@ def _object(scan: Scan, mine: NDArray[np.intp], box: Boxes) -> Object:
         label=np.full(len(mine), label, np.uint8)
         if scan.label is None
         else scan.label[mine],
+        raw_label=None if scan.raw_label is None else scan.raw_label[mine],
         ring=None if scan.ring is None else scan.ring[mine],
         boxes=replace(box, dont_care=np.zeros((0, 4), np.float32)),
         id=scan.id,

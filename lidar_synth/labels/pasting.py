@@ -122,7 +122,10 @@ def _raised(candidate: Object, height: float, sensor: Sensor) -> Object:
     if candidate.cast is not None:
         return Object(candidate.cast(boxes, sensor), height)
     points = candidate.scan.points + lift
-    return Object(replace(candidate.scan, points=points, boxes=boxes), height)
+    # Other lasers see it there.
+    return Object(
+        replace(candidate.scan, points=points, ring=None, boxes=boxes), height
+    )
 
 
 def _as_seen(scan: Scan, part: VisibleReturns) -> Scan:

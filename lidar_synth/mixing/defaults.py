@@ -16,6 +16,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.formats.camera_boxes import CameraBoxes
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.compose import Compose
 from lidar_synth.labels.mix import PasteObjects
@@ -132,7 +133,7 @@ def detection_options(real: Any, epochs: Any) -> dict[str, Any]:
             "mix(real, synth, task='detection', epochs=40)",
         )
     for source, _ in each(real):
-        if getattr(source, "beyond_view", False):  # KITTI's object set
+        if isinstance(source, CameraBoxes) and source.beyond_view:
             log.warning(
                 f"{source.root} has points all around and boxes in the camera's view only: a "
                 "detector would learn that objects elsewhere are background. Take "

@@ -1,8 +1,10 @@
 """Mixtures from plain settings, as trainers' configurations and YAML files hold them."""
 
 import inspect
+import logging
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ import numpy as np
 
 from lidar_synth.bank import Bank, is_bank
 from lidar_synth.bank.storage import is_url
-from lidar_synth.errors import ConfigError, choose, suggest
+from lidar_synth.errors import ConfigError, DataError, choose, suggest
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.as_sensor import make_transfer, read_transfer
@@ -22,6 +24,8 @@ from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.defaults import detection_options, segmentation_options
 from lidar_synth.mixing.scans import MixedScans, Ratio
 from lidar_synth.mixing.sources import each, sensor_of
+
+log = logging.getLogger(__name__)
 
 VARIABLE = "LIDAR_SYNTH_MIX"
 """Environment variable with the YAML file of settings, for trainers whose configuration allows no
@@ -193,10 +197,21 @@ def _agree(rule: Callable[[Sensor, Sensor], bool], reals: Any, synthetics: Any) 
 
 
 def _open_real(where: Any) -> Any:
-    """Open real scans by their path or URL; any other object is returned unchanged."""
+    """Open real scans by their path or URL; any other object is returned unchanged. Logs a warning
+    if scans of a validation or test split are among them."""
     if not isinstance(where, str | Path):
         return where
-    return Bank(where) if is_url(where) or is_bank(where) else open_scans(where)
+    if is_url(where) or is_bank(where):
+        return Bank(where)
+    scans = open_scans(where)
+    with suppress(ConfigError, DataError):  # the layout or the folder has no such split
+        count = len(open_scans(where, split="train"))
+        if count < len(scans):
+            log.warning(
+                f"{where} has splits, of which all {len(scans)} scans are taken. For the {count} "
+                f"of training alone: mix(open_scans({str(where)!r}, split='train'), ...)"
+            )
+    return scans
 
 
 def mix_for_trainer(

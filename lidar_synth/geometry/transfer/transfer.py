@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry.scan import Boxes, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.mount import Mount
@@ -27,6 +27,8 @@ from lidar_synth.noise import keyed_rng
 
 log = logging.getLogger(__name__)
 
+_SURFACE = 0.1  # metres that returns stick out of their box
+_FLOOR = 0.1  # metres above a box's bottom, below which a return is the road's
 SECTORS = 360
 """Sectors of azimuth, in which a scan has returns where its sensor looked."""
 
@@ -56,7 +58,7 @@ class Transfer:
 
     Label, raw label, instance, confidence and time are those of the nearest return; reflectance is
     interpolated; the ring is the target's laser. Boxes, pose and the rest move to the target's
-    frame.
+    frame; boxes in which the target has no return are left out.
 
     A scan of a sensor with the target's lasers, in the same place, keeps its returns: rays cast at
     its own surfaces add nothing (docs/research/transfer.md).
@@ -146,7 +148,7 @@ class Transfer:
             kept,
             sensor=self.target,
             reflectance=self.measurement.reflectances(kept.reflectance, self.target),
-            boxes=None if scan.boxes is None else scan.boxes[:],
+            boxes=_with_returns(kept.boxes, kept.points),
         )
 
     def _seen_by_target(
@@ -197,6 +199,7 @@ class Transfer:
             name: getattr(scan, name)
             for name in ("image_path", "id", "domain", "provenance")
         }
+        boxes = _with_returns(boxes, returns.points)
         return replace(returns, boxes=boxes, pose=pose, **kept), surfaces
 
     def _without_vehicle(self, scan: Scan) -> Scan:
@@ -288,6 +291,14 @@ class SeenAs:
         return self.transfer(
             self.source[index], keyed_rng(self.seed, index % len(self))
         )
+
+
+def _with_returns(boxes: Boxes | None, points: NDArray[np.float32]) -> Boxes | None:
+    """The boxes that hold a return."""
+    if boxes is None:
+        return None
+    held = boxes.enlarged(_SURFACE).contain(points, above_floor=_FLOOR + _SURFACE)
+    return boxes[held.any(axis=1)]
 
 
 @lru_cache(maxsize=256)

@@ -149,11 +149,17 @@ def stress(
 
     Raises:
         ConfigError: on an unknown corruption.
-        DataError: on scans without labels.
+        DataError: on scans without labels, or a network that recognises no point.
     """
     scores = {}
     for case in tqdm(cases(corruptions), unit="case", disable=not progress):
         scores[case] = mean_iou(model(corrupt(scans, case, seed), case))
+        if not scores["clean"]:
+            raise DataError(
+                "predictions of which none is right on the scans as they are",
+                f"train ids, 0 to {len(NAMES) - 1}",
+                "Map the network's own class ids to them.",
+            )
     by_name = {
         name: [scores[f"{name}/{severity}"] for severity in SEVERITIES]
         for name in corruptions

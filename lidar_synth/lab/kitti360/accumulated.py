@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import KITTI360 as CLASSES
+from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import list_files, write_file
-from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES
 from lidar_synth.formats.ply import map_vertices, vertex_header
 
 SPACING = 0.02

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES, WorldBoxes
+from lidar_synth.datasets.classes import MAX_INSTANCES
+from lidar_synth.formats.kitti360_boxes import WorldBoxes
 from lidar_synth.lab.kitti360.accumulated import cloud_values
 
 MARGIN = 0.2

@@ -21,6 +21,7 @@ from lidar_synth.lab.proof.arms import REAL, ArmStage, options_of
 from lidar_synth.lab.proof.trial import Job
 
 FIELD = "{job}"
+POOLS = "pools"
 _TAIL = 2000
 
 
@@ -30,10 +31,10 @@ class CommandTrainer:
 
     ``{job}`` in it stands for a YAML file with ``seed``, ``batch``, ``iterations``; ``real``, the
     folder of the labelled scans; ``stages``, one after the other, each with ``iterations``,
-    ``ratio``, ``synthetic`` (a folder, or null), ``labels``, as for ``MixedScans``, and ``rate``,
-    its learning rate as a share of yours; ``held_out``, a folder of scans without labels; and
-    ``predictions``, the folder to write one ``NNNNNN.label`` to for each of them. All folders of
-    scans have SemanticKITTI's layout, and predictions its values: (N,) uint32, one for each point.
+    ``ratio``, ``synthetic`` (a folder, or null) and ``labels``, as for ``MixedScans``;
+    ``held_out``, a folder of scans without labels; and ``predictions``, the folder to write one
+    ``NNNNNN.label`` to for each of them. All folders of scans have SemanticKITTI's layout, and
+    predictions its values: (N,) uint32, one for each point.
 
     Args:
         command: the words of the command, as a shell would split them.
@@ -59,6 +60,8 @@ class CommandTrainer:
             FileError, DataError: on missing or wrong predictions.
         """
         write_scans(job.real, job.folder / "real")
+        for name in job.pools.keys() - job.pool_folders.keys():
+            write_scans(job.pools[name], job.folder / POOLS / name)
         tested = [scan for part in job.held_out.values() for scan in part]
         bare = [replace(s, label=None, raw_label=None, instance=None) for s in tested]
         write_scans(bare, job.folder / "held_out")
@@ -104,16 +107,14 @@ def describe(job: Job) -> dict[str, Any]:
 
 
 def _describe_stage(job: Job, stage: ArmStage, iterations: int) -> dict[str, Any]:
-    folder = (
-        job.folder / "real" if stage.pool == REAL else job.pool_folders.get(stage.pool)
-    )
+    folder = job.pool_folders.get(stage.pool, job.folder / POOLS / stage.pool)
+    if stage.pool == REAL:
+        folder = job.folder / "real"
     options = options_of(stage, list(job.real))
     return {
         "iterations": iterations,
         "ratio": float(stage.ratio),
-        "synthetic": None
-        if not stage.ratio or folder is None
-        else str(folder.resolve()),
+        "synthetic": str(folder.resolve()) if stage.ratio else None,
         "labels": {stage.labels: options} if options else stage.labels,
     }
 

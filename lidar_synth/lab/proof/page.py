@@ -85,7 +85,7 @@ def what_was_done(values: Values) -> str:
         where = f"scans of {count} places that were recorded apart"
     return (
         f"The same small network was trained in {len(values['arms'])} ways on the same "
-        f"{values['labelled']} labelled scans, and tested on places that it had not seen: {where}, "
+        f"{values['labelled']}, and tested on places that it had not seen: {where}, "
         f"with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have the same "
         "iterations and augmentation, unless the table says otherwise. mIoU is the mean over "
         "classes of the share of correctly labelled returns (intersection over union)."
@@ -101,7 +101,7 @@ def protocol(values: Values) -> list[str]:
     ]
     return [
         f"Places: {', '.join(used)}. Tested: {', '.join(values['tested_places'])}.",
-        f"Label budget: {values['labelled']} labelled scans in each training, from as many places "
+        f"Label budget: {values['labelled']} in each training, from as many places "
         "as possible; another "
         "choice with each place and seed. The table says what else an arm uses.",
         f"Trainer: {values['trainer']}; {values['iterations']} iterations of {values['batch']} "

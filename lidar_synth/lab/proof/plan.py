@@ -4,7 +4,7 @@ A *pair* is a place that is left out and a seed; it has one training of every ar
 labelled scans. Only whole pairs are compared.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -72,9 +72,9 @@ class ProofPlan:
     device: str = "cpu"
 
     @property
-    def budget(self) -> int:
-        """Number of labelled scans that a training gets."""
-        return len(next(iter(self.labelled.values())))
+    def budget(self) -> str:
+        """How many labelled scans a training gets, as ``count_scans``."""
+        return count_scans([*map(len, self.labelled.values())], "labelled scan")
 
     def skin_scans(self, place: str) -> list[int]:
         """Indices of the scans, of other places than this, that a skin is learnt from; their labels
@@ -124,6 +124,14 @@ class ProofPlan:
         }
 
 
+def count_scans(numbers: Collection[int], kind: str) -> str:
+    """Numbers of scans in words, such as "1 labelled scan" or "2 to 7 labelled scans"."""
+    low = min(numbers)
+    high = max(numbers)
+    text = f"{low}" if low == high else f"{low} to {high}"
+    return f"{text} {kind}{'s' * (high != 1)}"
+
+
 def describe(plan: ProofPlan) -> str:
     """The plan in words, for a user who decides whether to start it."""
     tested = sorted({place for place, _ in plan.pairs})
@@ -134,7 +142,7 @@ def describe(plan: ProofPlan) -> str:
         + ", ".join(
             f"{name} ({len(members)})" for name, members in plan.places.items()
         ),
-        f"each training gets {plan.budget} labelled scans and is tested on {where}",
+        f"each training gets {plan.budget} and is tested on {where}",
         f"tested places: {', '.join(tested)}; seeds: {len({seed for _, seed in plan.pairs})}; "
         f"{len(plan.pairs)} of {plan.wanted} pairs of place and seed",
         f"classes without a label: {', '.join(plan.absent) or 'none'}",

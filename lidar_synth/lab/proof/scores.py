@@ -141,6 +141,7 @@ def interval(
     level: float = 0.95,
     seed: int = 0,
     draws: int = DRAWS,
+    shared: bool = False,
 ) -> tuple[float, float] | None:
     """Interval of the mean of paired differences, by a bootstrap over places and, within each, over
     seeds.
@@ -154,6 +155,8 @@ def interval(
         level: the share of such intervals that holds the true mean.
         seed: of the draws.
         draws: their number.
+        shared: whether the training of a seed is tested in all places; then each draw has the same
+            seeds for all of them.
 
     Returns:
         Both ends; None with fewer than ``FEWEST_PLACES`` places.
@@ -165,14 +168,20 @@ def interval(
         return None
     rng = np.random.default_rng(seed)
     means = np.empty((draws, count))
+    order = np.arange(draws)
+    if shared:
+        seeds = rng.integers(0, differences.shape[1], (draws, differences.shape[1]))
     for place, values in enumerate(there):
         # The means of drawn seeds of this place, which are used whenever the place is drawn.
-        seeds = rng.integers(0, len(values), (draws, len(values)))
-        means[:, place] = values[seeds].mean(1)
+        if not shared:
+            seeds = rng.integers(0, len(values), (draws, len(values)))
+        means[:, place] = values[seeds % len(values)].mean(1)
     drawn = rng.integers(0, count, (draws, count))
     totals = np.zeros(draws)
     for column in range(count):
-        totals += means[rng.permutation(draws), drawn[:, column]]
+        if not shared:
+            order = rng.permutation(draws)
+        totals += means[order, drawn[:, column]]
     tail = NormalDist().cdf(
         -sqrt(count / (count - 1)) * t_quantile((1 + level) / 2, count - 1)
     )

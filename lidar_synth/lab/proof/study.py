@@ -124,6 +124,7 @@ class Trainings:
         for kind in OF_GENERATOR & pools.keys():
             if whole and not has_lasers(plan.settings.model, plan.sensor):
                 pools[kind] = match_reflectance(pools[kind], real)
+                del folders[kind]
         return Job(
             row,
             seed,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.lab.proof.arms import BASE, GENERATOR_BUDGET, Row
 from lidar_synth.lab.proof.machine import command_line, machine
-from lidar_synth.lab.proof.plan import Pair, ProofPlan
+from lidar_synth.lab.proof.plan import Pair, ProofPlan, count_scans
 from lidar_synth.lab.proof.scores import (
     FEWEST_PLACES,
     group_ious,
@@ -19,6 +19,7 @@ from lidar_synth.lab.proof.scores import (
     mean_group_iou,
 )
 from lidar_synth.lab.proof.trial import LOOKS, TrialOutcome
+from lidar_synth.lab.town.returns import CALIBRATED_ON
 
 Results = dict[Pair, dict[Row, TrialOutcome]]
 """{pair: {arm: outcome}} of the complete pairs."""
@@ -101,9 +102,9 @@ def summarise(
         for row in plan.rows
     ]
     for row in arms:
-        row["budget"] = row["budget"].replace(
-            GENERATOR_BUDGET, f"{GENERATOR_BUDGET}: {seen}"
-        )
+        budget = row["budget"].replace(GENERATOR_BUDGET, f"{GENERATOR_BUDGET}: {seen}")
+        first, once, rest = budget.partition(f" ({CALIBRATED_ON})")
+        row["budget"] = first + once + rest.replace(once, "")
     sizes = {
         name: {"scans": len(part), "tested": len(plan.tested[name])}
         for name, part in plan.places.items()
@@ -160,6 +161,12 @@ def _mean(values: NDArray[np.float64]) -> float:
     return float(np.nanmean(np.nanmean(values, 1)))
 
 
+def _interval(
+    plan: ProofPlan, differences: NDArray[np.float64]
+) -> tuple[float, float] | None:
+    return interval(differences, shared=plan.training is not None)
+
+
 def _arm(
     plan: ProofPlan,
     found: Results,
@@ -185,7 +192,7 @@ def _arm(
         "synthetic": bool(row.arm.pools()),
         "miou": _mean(scores[row]),
         "difference": None if first else _mean(difference),
-        "interval": None if first else interval(difference),
+        "interval": None if first else _interval(plan, difference),
         "better_in": ""
         if first
         else f"{int((judged > 0).sum())} of {len(judged)} places",
@@ -208,14 +215,14 @@ def _known(value: float) -> float | None:
 
 def _budget(plan: ProofPlan, row: Row) -> str:
     real = any(stage.ratio < 1 for stage in row.stages())
-    text = f"{plan.budget} {'labelled' if real else 'unlabelled'} scans"
+    text = plan.budget if real else plan.budget.replace("labelled", "unlabelled")
     if not row.arm.budget:
         return text
     extra = row.arm.budget
     if any(pool == "skin" for pool in row.arm.pools()):
-        scans = len(plan.skin_scans(plan.pairs[0][0]))
+        learnt = [len(plan.skin_scans(place)) for place, _ in plan.pairs]
         extra = extra.replace(
-            "scans of the training places", f"{scans} scans of the training places"
+            "scans of the training", f"{count_scans(learnt, 'scan')} of the training"
         )
     return f"{text}; {extra}"
 
@@ -262,7 +269,7 @@ def _chosen_elsewhere(
     chosen = np.stack([gains[arm, place] for place, arm in enumerate(picked)])
     return {
         "difference": _mean(chosen),
-        "interval": interval(chosen),
+        "interval": _interval(plan, chosen),
         "arms": [rows[i].key for i in picked],
     }
 
@@ -285,7 +292,7 @@ def _over_best_real(
         "title": best.title,
         "real": other.title,
         "difference": _mean(difference),
-        "interval": interval(difference),
+        "interval": _interval(plan, difference),
     }
 
 
@@ -294,7 +301,7 @@ def headline(values: Mapping[str, Any]) -> str:
     arms = {row["key"]: row for row in values["arms"]}
     over = values["over_best_real"]
     base = arms[BASE]
-    start = f"With {values['labelled']} labelled scans"
+    start = f"With {values['labelled']}"
     if over is None:
         return (
             f"{start}, real scans only reach {base['miou']:.1f} % mIoU; no arm with synthetic "
@@ -348,6 +355,12 @@ def limits(values: Mapping[str, Any]) -> list[str]:
             f"time: {len(values['tested_places'])} of {len(values['places'])} places were tested, "
             f"with {values['seeds']} seed{'s' * (values['seeds'] > 1)}. Run the same command with "
             "more --minutes to add the others."
+        )
+    if not values["left_out"]:
+        found.append(
+            "The training of a seed is tested in all places. An interval over "
+            f"{values['seeds']} seed{'s' * (values['seeds'] > 1)} is too narrow if trainings "
+            "differ as much as places; 5 seeds or more (--seeds) make it reliable."
         )
     if values["absent"]:
         found.append(

@@ -51,7 +51,8 @@ class Job:
         widths: channels of the reference network by level.
         half: whether the reference network computes in bfloat16.
         folder: where a trainer may write files.
-        pool_folders: {name: folder} of the pools, in SemanticKITTI's layout.
+        pool_folders: {name: folder} of the pools that files hold as they are, in SemanticKITTI's
+            layout.
         device: on which the reference network computes.
     """
 

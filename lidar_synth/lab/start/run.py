@@ -15,7 +15,7 @@ from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.claims import claim, hold_writing
 from lidar_synth.files.disk import write_file
 from lidar_synth.files.processes import usable_cores
-from lidar_synth.formats import KITTIObject
+from lidar_synth.formats.camera_boxes import CameraBoxes
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model
 from lidar_synth.geometry.sensor import Sensor, presets, sensor_yaml
@@ -240,7 +240,7 @@ def start(
         raise ConfigError(f"--out {out} inside of {root}", "a folder outside of it")
     found = look(root, sensor, out / SENSOR, reading)
     task = _task(found, task)
-    if task == "detection" and isinstance(found.source, KITTIObject):
+    if task == "detection" and isinstance(found.source, CameraBoxes):
         found = replace(found, source=found.source.with_boxes())
     plan = _plan(found, task, out, scans, minutes, jobs or usable_cores())
     if trainer is not None:
@@ -443,7 +443,7 @@ def _code(plan: StartPlan) -> str:
         given += f", ratio={settings['ratio']}, epoch_size={settings['epoch_size']!r}"
     detection = plan.task == "detection"
     target = "boxes" if detection else "label"
-    cropped = detection and isinstance(plan.found.source, KITTIObject)
+    cropped = detection and isinstance(plan.found.source, CameraBoxes)
     boxed = ".with_boxes()" if cropped else ""
     if detection:
         given += ', task="detection"'

@@ -59,7 +59,7 @@ write_infos("HERE/mixed", train, mix, data_root=root, points="training/velodyne_
         "mmdet3d::pointpillars/pointpillars_hv_secfpn_8xb6-160e_kitti-3d-3class.py",
     ).replace(
         "DATASET",
-        'dict(dataset=dict(type="SynthKittiDataset", data_root="",\n'
+        'dict(times=1, dataset=dict(type="SynthKittiDataset", data_root="",\n'
         '        ann_file="HERE/mixed/infos.json", data_prefix=dict(pts=""),\n'
         "        filter_empty_gt=False))",
     ),
@@ -78,7 +78,7 @@ _base_ = ["semseg-spunet-v1m1-0-base.py"]
 custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False)
 hooks = [dict(type="SynthEpoch"), dict(type="CheckpointLoader"), dict(type="ModelHook"),
          dict(type="IterationTimer"), dict(type="InformationWriter"), dict(type="SemSegEvaluator"),
-         dict(type="CheckpointSaver")]
+         dict(type="CheckpointSaver"), dict(type="PreciseEvaluator", test_last=False)]
 data = dict(train=dict(type="MixedSemanticKITTI", data_root="ROOT", mixture="MIX"))
 """
 
@@ -86,7 +86,7 @@ _RANGENET = """# in train/tasks/semantic of lidar-bonnetal or SalsaNext, or in C
 # bash HERE/train.sh
 export LIDAR_SYNTH_MIX=MIX
 python -m lidar_synth.integrations.rangenet train.py -d ROOT -ac ARCH.yaml \\
-    -dc config/labels/semantic-kitti.yaml -l HERE/log
+    -dc config/labels/semantic-kitti.yaml -l HERE/log -n mixed    # of SalsaNext also: -p ""
 """
 
 _CYLINDER3D = """# in Cylinder3D: bash HERE/train.sh

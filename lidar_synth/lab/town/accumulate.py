@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.kitti360 import label_values
-from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.kitti360.accumulated import REACH, SPACING, write_cloud
 from lidar_synth.lab.town.town import Town

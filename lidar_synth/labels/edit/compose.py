@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import SEMANTIC_KITTI
+from lidar_synth.datasets.classes import MAX_INSTANCES, SEMANTIC_KITTI
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.labels.edit.rays import ScanRays
 
@@ -29,7 +29,8 @@ def replace_returns(
 
     Returns:
         The scan with its remaining points unchanged and in order, and new ones in place of the
-        return of their ray, or after the return before it in the ring. Its domain is ``SYNTHETIC``.
+        return of their ray, or after the return before it in the ring. Its domain is ``SYNTHETIC``;
+        it has no camera image, which would show what was there before.
     """
     kept = scan[~removed]
     place = _place(rays, which)
@@ -47,14 +48,17 @@ def replace_returns(
         )
     if scan.raw_label is not None:
         fields["raw_label"] = _raw(kept, new, order)
-    return replace(scan, **fields, domain=SYNTHETIC)
+    return replace(scan, **fields, domain=SYNTHETIC, image_path=None)
 
 
 def next_instance(scan: Scan) -> int:
-    """The first instance number that neither points nor boxes of a scan have."""
-    used = [] if scan.instance is None else [scan.instance]
-    used += [] if scan.boxes is None else [scan.boxes.instance]
-    return max((int(numbers.max(initial=0)) for numbers in used), default=0) + 1
+    """The first instance number that neither points nor boxes of a scan have, in any class of
+    KITTI-360, whose numbers are id * ``MAX_INSTANCES`` + n."""
+    given = [] if scan.instance is None else [scan.instance]
+    given += [] if scan.boxes is None else [scan.boxes.instance]
+    used = np.unique(np.concatenate([[0], *given]))
+    taken = np.concatenate([used, used % MAX_INSTANCES])
+    return int(np.setdiff1d(np.arange(len(taken) + 1), taken)[0])
 
 
 def _place(rays: ScanRays, which: NDArray[np.intp]) -> NDArray[np.int64]:
@@ -66,22 +70,24 @@ def _place(rays: ScanRays, which: NDArray[np.intp]) -> NDArray[np.int64]:
 
 
 def _raw(kept: Scan, new: Scan, order: NDArray[np.intp]) -> NDArray[np.uint32] | None:
-    """The labels as in the file, new points with SemanticKITTI's static classes; None for ids of
-    another dataset."""
-    raw = kept.raw_label
-    label = new.label
-    if raw is None or label is None:
+    """The labels as in SemanticKITTI's files, with static classes for new points that have none;
+    None for ids of another dataset."""
+    if kept.raw_label is None or new.label is None or _classes(kept) is None:
         return None
+    classes = _classes(new)
+    if classes is None:
+        classes = SEMANTIC_KITTI.encode(new.label)
+    if new.instance is not None:
+        classes = classes | new.instance.astype(np.uint32) << np.uint32(16)
+    return np.concatenate([kept.raw_label, classes])[order]
+
+
+def _classes(scan: Scan) -> NDArray[np.uint32] | None:
+    """(N,) SemanticKITTI's classes of a scan's ``raw_label``; None if its labels are others."""
+    assert scan.raw_label is not None
+    classes = scan.raw_label & np.uint32(0xFFFF)
     try:
-        same = (
-            SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16)) == kept.label
-        ).all()
+        same = SEMANTIC_KITTI.decode(classes.astype(np.uint16)) == scan.label
     except ValueError:
         return None
-    instance = (
-        np.zeros(len(new), np.uint32)
-        if new.instance is None
-        else new.instance.astype(np.uint32)
-    )
-    added = SEMANTIC_KITTI.encode(label).astype(np.uint32) | instance << np.uint32(16)
-    return np.concatenate([raw, added])[order] if same else None
+    return classes if same.all() else None

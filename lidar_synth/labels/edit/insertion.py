@@ -102,6 +102,7 @@ def insert(
     Returns:
         A new scan with the object's box (a scan without boxes then has this one alone) and, if it
         has instances, a new instance. Its labels are those of the object, if the scan has labels.
+        It has no camera image.
 
     Raises:
         DataError: if the place is outside the sensor's range, taken, or without ground; if the
@@ -122,10 +123,16 @@ def insert(
 
 
 def _set(
-    scan: Scan, item: Object, placed: Placed, least: int, estimated: NDArray[np.bool_]
+    scan: Scan,
+    item: Object,
+    placed: Placed,
+    least: int,
+    estimated: NDArray[np.bool_],
+    instance: int = -1,
 ) -> Scan:
     """Set an object into a scan at its place; it replaces (N,) estimated returns, whatever their
-    distance."""
+    distance. Its instance is a new one, if points of the scan have instances, unless it is
+    known."""
     rays = rays_of_scan(scan)
     window = np.flatnonzero(rays.through(placed.box, margin=0.3))
     rho, hits, at = _hits(item, placed, rays, window)
@@ -147,22 +154,20 @@ def _set(
     replaced[points[points >= 0]] = True
     remaining, boxes = still_visible(scan, ~replaced, least)
     which = window[seen]
-    fields = _fields(scan, item, hits, at[seen])
+    if instance <= 0 and scan.instance is not None:
+        instance = next_instance(scan)
     new = replace(
         scan[np.zeros(len(which), np.intp)],
         points=rays.points(which, rho[seen]),
-        **fields,
+        **_fields(scan, instance, hits, at[seen]),
     )
     assert item.scan.boxes is not None
-    instance = np.array(
-        [next_instance(scan) if scan.instance is not None else -1], np.int32
-    )
     values = grow_box(placed.box, new.points)[None]
     own = Boxes(
         values,
         item.scan.boxes.names,
         occlusion=item.scan.boxes.occlusion.copy(),
-        instance=instance,
+        instance=np.array([instance], np.int32),
     )
     own = update_occlusion(own, np.array([seen.sum() / np.isfinite(rho).sum()]))
     result = replace_returns(scan, ~remaining, rays, which, new)
@@ -188,7 +193,7 @@ def move(
         model, seed: see ``remove``.
 
     Returns:
-        A new scan; the moved box is the last one.
+        A new scan; the moved box is the last one, with its instance.
 
     Raises:
         DataError, ConfigError: as ``remove`` and ``insert``.
@@ -210,7 +215,9 @@ def move(
     placed = _place(
         emptied[recorded], cut, pose, _with_foot(emptied[ground], cut), gone=box
     )
-    return _set(emptied, cut, placed, least, ~recorded)
+    assert cut.scan.boxes is not None
+    instance = int(cut.scan.boxes.instance[0])
+    return _set(emptied, cut, placed, least, ~recorded, instance)
 
 
 def _with_foot(scan: Scan, item: Object) -> Scan:
@@ -404,6 +411,7 @@ def _surfaces(part: Scan) -> ScanSurfaces:
             part.reflectance,
             sensor,
             label=part.label,
+            raw_label=part.raw_label,
             ring=ring.astype(np.int16),
             id=part.id,
         )
@@ -429,20 +437,20 @@ def _behind(
 
 
 def _fields(
-    scan: Scan, item: Object, hits: Hits, at: NDArray[np.intp]
+    scan: Scan, instance: int, hits: Hits, at: NDArray[np.intp]
 ) -> dict[str, Any]:
     """The fields of the object's points that the scan has."""
     row, firing = at.T
-    fields: dict[str, Any] = {
-        "reflectance": hits.nearest.value[row, firing].astype(np.float32)
+    vertex = hits.nearest.vertex
+    fields = {
+        "raw_label": np.zeros(len(at), np.uint32),
+        "cause": np.zeros(len(at), np.uint8),
+        "reflectance": hits.nearest.value[row, firing].astype(np.float32),
+        "instance": np.full(len(at), instance, np.int32),
+        "confidence": np.ones(len(at), np.float32),
+        **hits.carried(row * vertex.shape[1] + firing),
     }
-    if scan.label is not None:
-        fields["label"] = hits.fields["label"][hits.nearest.vertex[row, firing]]
-    if scan.instance is not None:
-        fields["instance"] = np.full(len(row), next_instance(scan), np.int32)
-    if scan.confidence is not None:
-        fields["confidence"] = np.ones(len(row), np.float32)
-    return fields
+    return {name: fields[name] for name in fields.keys() & scan.fields().keys()}
 
 
 def _place_text(box: NDArray[np.float32]) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND, has_ground
+from lidar_synth.datasets.classes import GROUND, IGNORE, has_ground
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grow_box, widen_boxes
@@ -53,8 +53,8 @@ def remove(
         seed: of the model's noise.
 
     Returns:
-        A new scan. All other points, labels, boxes and instances are unchanged; without boxes to
-        remove, it is the scan as it was given.
+        A new scan without a camera image. All other points, labels, boxes and instances are
+        unchanged; without boxes to remove, it is the scan as it was given.
 
     Raises:
         DataError: on a box that the scan does not have, that is out of the sensor's range or that
@@ -237,8 +237,8 @@ def _copies(
     donor: NDArray[np.int64],
     rho: NDArray[np.float64],
 ) -> Scan:
-    """One point for each ray of the hole, with the fields of its source; points at the origin have
-    no return."""
+    """One point for each ray of the hole, with the fields of its source, ignored if that has no
+    return; points at the origin have no return."""
     found = np.isfinite(rho)
     points = np.where(
         found[:, None], rays.points(which, np.where(found, rho, 0.0)), np.float32(0)
@@ -246,8 +246,14 @@ def _copies(
     distance = np.linalg.norm(points, axis=1)
     near = distance < scan.sensor.range_min
     points[near | (distance > scan.sensor.range_max)] = 0
-    copies = scan[np.maximum(rays.point[donor], 0)]
+    source = rays.point[donor]
+    copies = scan[np.maximum(source, 0)]
     fields: dict[str, Any] = {"points": points.astype(np.float32)}
     if scan.instance is not None:
         fields["instance"] = np.zeros(len(which), np.int32)
+    # A model may draw a return there.
+    unknown = {"label": IGNORE, "raw_label": 0, "confidence": 0, "cause": 0}
+    for name in unknown.keys() & scan.fields().keys():
+        values = getattr(copies, name)
+        fields[name] = np.where(source < 0, unknown[name], values).astype(values.dtype)
     return replace(copies, **fields)

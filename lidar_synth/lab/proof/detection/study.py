@@ -18,7 +18,8 @@ from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names, write_file
 from lidar_synth.files.parsing import read_sealed, seal
-from lidar_synth.formats import KITTIObject, open_scans
+from lidar_synth.formats import open_scans
+from lidar_synth.formats.camera_boxes import CameraBoxes
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.generate.devices import check_device
 from lidar_synth.geometry.overlap import count_overlapping
@@ -102,9 +103,8 @@ class DetectionSettings:
 
 
 def with_boxes(source: Source) -> Source:
-    """A source as detectors learn from it: of KITTI's object set, the scans with boxes, in the
-    camera's view."""
-    return source.with_boxes() if isinstance(source, KITTIObject) else source
+    """A source as detectors learn from it: of KITTI, the scans with boxes, in the camera's view."""
+    return source.with_boxes() if isinstance(source, CameraBoxes) else source
 
 
 def half_of(
@@ -292,7 +292,7 @@ def prove_detection(
     add arms and seeds.
 
     Args:
-        scans: real scans with boxes: what ``open_scans`` opens, or a source. KITTI's object set is
+        scans: real scans with boxes: what ``open_scans`` opens, or a source. KITTI's are
             cropped to the camera's view (``KITTIObject.with_boxes``).
         out: folder to write to: outcomes, ``results.json`` and the page ``index.html``.
         settings: of the comparison.

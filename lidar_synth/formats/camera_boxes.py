@@ -1,0 +1,64 @@
+"""``CameraBoxes``, the base class of readers of scans with boxes in a camera's view only."""
+
+from abc import abstractmethod
+from copy import copy
+from dataclasses import replace
+from typing import Any
+
+from lidar_synth.errors import DataError
+from lidar_synth.formats.calibration import in_view
+from lidar_synth.formats.source import ScanFiles
+from lidar_synth.geometry.scan import Scan
+
+IMAGE_SIZE = (1242, 375)
+"""(width, height) of KITTI's images in pixels, taken where no file tells it."""
+
+
+class CameraBoxes(ScanFiles):
+    """Scans with points all around, in which objects have boxes only in the view of KITTI's
+    camera 2."""
+
+    _cropped = False
+
+    @property
+    def beyond_view(self) -> bool:
+        """Whether its scans have points outside of the camera's view, where KITTI has no boxes."""
+        return not self._cropped
+
+    def with_boxes(self) -> "CameraBoxes":
+        """The scans with boxes, cropped to the view of camera 2: KITTI has boxes nowhere else, so
+        that a detector would learn that objects outside of the view are background.
+
+        Raises:
+            DataError: if no scan has boxes.
+        """
+        ids = [name for name in self.ids if self._has_boxes(name)]
+        if not ids:
+            raise DataError(f"{self.root} without boxes", "a dataset with them")
+        part = copy(self)
+        part.ids = tuple(ids)
+        part._cropped = True
+        return part
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """See ``ScanFiles.options``."""
+        return {"cropped": True} if self._cropped else {}
+
+    @abstractmethod
+    def _has_boxes(self, name: str) -> bool:
+        """Whether the boxes of a scan are known, by its id."""
+
+    def _in_view(self, scan: Scan, index: int) -> Scan:
+        """The scan, cropped if the source is; raises ``DataError`` if it has no calibration."""
+        if not self._cropped:
+            return scan
+        camera = self.calibration(index)
+        if camera is None:
+            raise DataError(
+                f"scan {scan.id} of {self.root} without calibration",
+                "the dataset's calib files, which tell what camera 2 sees",
+            )
+        return in_view(
+            scan, replace(camera, image_size=camera.image_size or IMAGE_SIZE)
+        )
