@@ -10,6 +10,7 @@ import json
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import cache
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -180,12 +181,12 @@ class Folder:
         return self._cached[key]
 
     def _position(self, epoch: int, slot: int) -> tuple[int, int]:
-        """Epoch and position of a slot: in this epoch, or in the latest one with synthetic scans if
-        it has none."""
+        """Epoch and position of a slot: in this epoch, or the latest one before it, or the next one
+        after it, that has synthetic scans."""
         if not 0 <= slot < self.slots:
             raise DataError(f"slot {slot} of {self.path}", f"0 to {self.slots - 1}")
-        while not self.mixed.plan(epoch).synthetics:
-            epoch -= 1
+        tried = chain(range(epoch, -1, -1), count(epoch + 1))
+        epoch = next(e for e in tried if self.mixed.plan(e).synthetics)
         positions = np.flatnonzero(self.entries(epoch) >= self.real)
         return epoch, int(positions[slot % len(positions)])
 

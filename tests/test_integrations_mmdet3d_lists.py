@@ -308,6 +308,21 @@ def test_two_runs_that_share_a_list_have_their_own_epochs(
     assert {path: path.read_bytes() for path in (tmp_path / "m").iterdir()} == before
 
 
+def test_a_list_may_begin_with_real_scans_alone(scans: Path, tmp_path: Path) -> None:
+    """A detector's list needs the boxes of its slots before the first epoch."""
+    real = semantic_kitti_list(
+        semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json"
+    )
+    settings = {"synthetic": scans, "ratio": {0: 0.0, 2: 0.5}}
+    write_infos(tmp_path / "m", real, settings, data_root=tmp_path / "sk")
+    early = Folder.open(tmp_path / "m")
+    late = Folder.open(tmp_path / "m")
+    late.epoch = 2
+    assert early.slots == REAL
+    for slot in range(REAL):
+        assert early.scan(slot).id == late.scan(slot).id
+
+
 @pytest.mark.parametrize(
     ("settings", "shares"),
     [
