@@ -54,8 +54,8 @@ SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 BOXES = ".boxes.json"
 """Suffix of the boxes beside a file of points."""
 
+# Fields of clouds that mean something else in files of other programs.
 _OURS = ("label", "confidence", "cause")
-# fields of clouds that mean something else in files of other programs
 
 
 class Folder(ScanFiles):

@@ -116,13 +116,20 @@ class StartPlan:
         decided = ends_on_real(len(self.found.source), alike)
         if self.task == "segmentation" and decided:
             return True
-        one = self.found.drives == 1 and _places(self) == "stretch"
-        return self.task != "unlabelled" and one
+        return self.task != "unlabelled" and self.one_drive
+
+    @cached_property
+    def one_drive(self) -> bool:
+        """Whether the scans are of one drive, with no poses that tell places apart."""
+        return self.found.drives == 1 and _places(self) == "stretch"
 
     def settings(self) -> dict[str, Any]:
         """The mixture, as trainers read it."""
-        settings: dict[str, Any] = {"ratio": 1.0, "labels": "generated"}
-        settings["epoch_size"] = "replace"
+        settings: dict[str, Any] = {
+            "ratio": 1.0,
+            "labels": "generated",
+            "epoch_size": "replace",
+        }
         first = self.task == "segmentation" and not self.ends_on_real
         if self.task == "detection" or first:
             settings = dict(DEFAULTS[self.task])
@@ -349,7 +356,7 @@ def _compare(plan: StartPlan, say: Callable[[str], None]) -> str:
 def _report(plan: StartPlan, table: str) -> str:
     """The result of a comparison, where to read it, and what it cannot say."""
     page = f"The page is {plan.out / 'proof' / 'index.html'}"
-    if _places(plan) != "stretch":
+    if not plan.one_drive:
         return f"{table}\n\n{page}"
     return f"{table}\n\n{_ONE_DRIVE}\n{page}"
 
