@@ -22,6 +22,7 @@ FURTHER = {
     "lidar_synth.datasets.classes": ("Taxonomy",),
     "lidar_synth.lab.evaluate": ("Metric",),
     "lidar_synth.lab.evaluate.segmentation": ("load_judge",),
+    "lidar_synth.formats.camera_boxes": ("CameraBoxes.with_boxes",),
     "lidar_synth.generate.flow.solvers": ("solve",),
     "lidar_synth.geometry.normalize": ("Normalisation",),
     "lidar_synth.geometry.projection": ("locate",),

@@ -3,6 +3,7 @@
 import os
 import zipfile
 from pathlib import Path
+from typing import BinaryIO
 
 import numba
 import numpy as np
@@ -11,11 +12,25 @@ from banks import add_stray, some_image
 
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.compiled import keep_compiled_code
-from lidar_synth.files.disk import remove_file, write_arrays
+from lidar_synth.files.disk import remove_file, write_arrays, write_file
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.npz import read_arrays, write_range_image, write_scan
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import Boxes
+
+
+def test_the_first_of_several_writers_wins(tmp_path: Path) -> None:
+    path = tmp_path / "settings.json"
+
+    def overtaken(file: BinaryIO) -> None:
+        path.write_bytes(b"first")
+        Path(file.name).unlink()  # as a bake does with files that it takes for leftovers
+
+    write_file(path, overtaken, overwrite=False)
+    write_file(path, b"third", overwrite=False)
+    assert path.read_bytes() == b"first"
+    with pytest.raises(FileError, match="cannot be written"):
+        write_file(tmp_path / "other", lambda f: Path(f.name).unlink(), overwrite=False)
 
 
 @pytest.mark.parametrize("compressed", [False, True])

@@ -178,6 +178,8 @@ def test_a_cache_of_scans_that_have_changed_is_refused(
     note.write_bytes(seal({k: v for k, v in facts.items() if k != "files"}))
     cache()  # of an earlier version
     note.write_bytes(whole)
+    (root / "image.png").write_bytes(b"added later")
+    cache()
     corrected = next(root.rglob("*.label"))
     os.utime(corrected, (0, corrected.stat().st_mtime + 60))  # as large as before
     with pytest.raises(ConfigError, match=r"cache of other data \(files differ\)"):

@@ -91,10 +91,9 @@ def _linked(part: Path, path: Path) -> bool:
     links."""
     try:
         os.link(part, path)
-    except FileExistsError:
-        return True
     except OSError:
-        return False
+        # Also where the process that won has removed this one's temporary file.
+        return path.exists()
     return True
 
 

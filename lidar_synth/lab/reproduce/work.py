@@ -256,9 +256,9 @@ def write_town(works: Mapping[str, TaskRun]) -> None:
     for work in works.values():
         layout = work.task.layout
         for seed, number in enumerate(TINY[layout]):
-            camera = "camera" in works and layout == "kitti360"
-            home = work.folder / ("images" if camera else "town")
-            out = home / f"{layout}-{number}"
+            out = work.folder / "town" / f"{layout}-{number}"
+            # with images for every table, so that all tables share one cache
+            camera = layout == "kitti360"
             export_town(
                 Town(seed, SENSOR, 2), out, layout, sequence=number, camera=camera
             )

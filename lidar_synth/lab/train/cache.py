@@ -15,7 +15,7 @@ from torch import Tensor
 from lidar_synth.bank.encoding import LEVELS, TYPES, Encoding
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names
-from lidar_synth.formats import ScanFiles
+from lidar_synth.formats import RangePNG, ScanFiles
 from lidar_synth.generate.codec import Codec
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import project
@@ -28,6 +28,8 @@ DTYPES: dict[str, type[np.generic]] = {
     name: TYPES[name] for name in ("range", "reflectance", "label")
 }
 """Data type of each channel in a cache, the same as in a bank."""
+
+CAMERA_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,9 @@ def cache_scans(
     }
     if others:
         facts["others"] = {name: other.facts for name, other in others.items()}
-    if folder is not None and (files := _hash_of_files(source, folder)):
+    if folder is not None and (
+        files := _hash_of_files(source, folder, images=bool(others))
+    ):
         facts[FILES] = files
 
     make = _Project(source, sensor, tuple(names), others)
@@ -146,24 +150,29 @@ def cache_scans(
     )
 
 
-def _hash_of_files(source: Any, cache: Path) -> str | None:
+def _hash_of_files(source: Any, cache: Path, images: bool) -> str | None:
     """A hash of the ids of a source, and of the names, sizes and modification times of the files at
-    its root, or at those of several; None for scans that are no files, such as the town's."""
+    its root, or at those of several; None for scans that are no files, such as the town's.
+
+    Camera images count only where ``images`` says so: a dataset may get them later.
+    """
     told: list[str] = []
     for part in getattr(source, "datasets", [source]):
         if isinstance(part, ScanFiles):
-            told += [*part.ids, *_tell_files(part.root, cache)]
+            skipped = () if images or isinstance(part, RangePNG) else CAMERA_SUFFIXES
+            told += [*part.ids, *_tell_files(part.root, cache, skipped)]
     return hash_of_names(told) if told else None
 
 
-def _tell_files(root: Path, cache: Path) -> Iterator[str]:
+def _tell_files(root: Path, cache: Path, skipped: tuple[str, ...]) -> Iterator[str]:
     """Name, size and modification time of each file below a folder; or of the file."""
     # A run that lies among its scans writes beside its cache.
     own = {cache.resolve(), cache.parent.resolve()}
     paths = [root]
     for folder, names, files in os.walk(root, followlinks=True):
         names[:] = [n for n in names if Path(folder, n).resolve() not in own]
-        paths += [Path(folder, name) for name in files if name[0] != "."]
+        kept = (name for name in files if name[0] != "." and not name.endswith(skipped))
+        paths += [Path(folder, name) for name in kept]
     for path in sorted(paths):
         if path.is_file():
             found = path.stat()
