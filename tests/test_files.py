@@ -24,7 +24,8 @@ def test_the_first_of_several_writers_wins(tmp_path: Path) -> None:
 
     def overtaken(file: BinaryIO) -> None:
         path.write_bytes(b"first")
-        Path(file.name).unlink()  # as a bake does with files that it takes for leftovers
+        # as a bake does with files that it takes for leftovers
+        Path(file.name).unlink()
 
     write_file(path, overtaken, overwrite=False)
     write_file(path, b"third", overwrite=False)
