@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
+from urllib.parse import urlsplit
 
 
 @dataclass
@@ -48,7 +49,8 @@ def serve(root: Path) -> Iterator[Served]:
         protocol_version = "HTTP/1.1"
 
         def do_GET(self) -> None:
-            path = root / self.path.lstrip("/")
+            # A proxy is asked for a complete URL.
+            path = root / urlsplit(self.path).path.lstrip("/")
             name = path.name
             if served.busy and len(served.requests) % served.busy == served.busy - 1:
                 self._answer(503, b"", {})

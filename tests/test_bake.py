@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import math
 import os
 import re
 import shutil
@@ -242,22 +243,50 @@ def test_shares_in_any_order_write_the_same_bytes(
     assert files(plan.out) == expected
 
 
+def test_a_plan_may_be_used_in_another_folder(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As actors of Ray do, which run in the folder in which their cluster was started."""
+    monkeypatch.chdir(tmp_path)
+    plan = prepare(plan_in(Path("bank"), model))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    ENGINES["local"](plan, [3], Resources(), lambda scans: None)
+    assert (tmp_path / "bank" / "shard-00003.h5").is_file()
+
+
+@pytest.mark.parametrize("shares", [1, 2])
 @pytest.mark.parametrize("ranks", [(0,), (1, 0), (1, 2, 0)])
 def test_ranks_of_torchrun_one_after_another_write_the_same_bytes(
     plan: BakePlan,
     expected: dict[str, bytes],
     ranks: tuple[int, ...],
+    shares: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """The ranks divide the run's share evenly, whatever is missing, and check only their part."""
     with pytest.raises(
         ConfigError, match="engine 'torchrun' without 'RANK'.*torchrun --nproc-per-node"
     ):
         bake(plan, "torchrun", progress=False)
+    checked: list[Path] = []
+    monkeypatch.setattr(
+        "lidar_synth.bake.folder.sha256",
+        lambda path: checked.append(path) or sha256(path),
+    )
     monkeypatch.setenv("WORLD_SIZE", str(len(ranks)))
-    for rank in ranks:
-        monkeypatch.setenv("RANK", str(rank))
-        monkeypatch.setenv("LOCAL_RANK", str(rank))
-        index = bake(plan, "torchrun", progress=False)
+    for share in range(shares):
+        part = 4 // shares / len(ranks)
+        for rank in ranks:
+            monkeypatch.setenv("RANK", str(rank))
+            monkeypatch.setenv("LOCAL_RANK", str(rank))
+            before = len(list(plan.out.glob("*.h5")))
+            index = bake(plan, "torchrun", share=Share(share, shares), progress=False)
+            made = len(list(plan.out.glob("*.h5"))) - before
+            assert math.floor(part) <= made <= math.ceil(part) and checked == []
+            bake(plan, "torchrun", share=Share(share, shares), progress=False)
+            assert len(checked) == made
+            checked.clear()
     assert index is not None and files(plan.out) == expected
 
 

@@ -292,6 +292,9 @@ def test_a_bank_can_be_opened_and_converted_like_any_source(
     assert type(scans) is BankScans and scans.ids[4] == "small/5/4"
     with pytest.raises(ConfigError, match="sensor os1_128 for .*; expected 'small'"):
         open_scans(root, sensor="os1_128")
+    with pytest.raises(ConfigError, match="expected 'small', whose scans it holds"):
+        open_scans(root, sensor=replace(SENSOR, fov_up=SENSOR.fov_up + 1))
+    assert len(open_scans(root, sensor=replace(SENSOR, name="mine"))) == len(scans)
     convert(scans, WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
     back = open_scans(tmp_path / "out", sensor=SENSOR)
     assert len(list(tmp_path.rglob("*.label"))) == 5

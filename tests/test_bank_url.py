@@ -10,7 +10,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from banks import some_image, write_bank
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from servers import Served, serve
 from torch.utils.data import DataLoader
 
@@ -107,6 +107,16 @@ def test_forked_workers_read_from_a_url(served: Served) -> None:
         bank, batch_size=None, num_workers=2, multiprocessing_context="fork"
     )  # type: ignore[arg-type]
     assert sum(len(scan) for scan in loader) == expected
+
+
+def test_a_bank_is_read_through_the_proxy_of_the_environment(
+    served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("http_proxy", served.url)
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    far = Bank("http://bank.invalid/bank")
+    assert np.array_equal(far[1].points, Bank(tmp_path / "bank")[1].points)
 
 
 def test_a_server_without_ranges_is_refused(served: Served) -> None:
@@ -222,7 +232,14 @@ def test_an_index_with_exaggerated_sizes_is_refused(
         Bank(f"{served.url}/bank").image(0)
 
 
-@settings(max_examples=60)
+@pytest.fixture(params=["any", "Windows"])
+def system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This system, or one without ``os.pread``."""
+    if request.param == "Windows":
+        monkeypatch.delattr("os.pread", raising=False)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     size=st.integers(1, 5000),
     head=st.integers(0, 6000),
@@ -230,6 +247,7 @@ def test_an_index_with_exaggerated_sizes_is_refused(
 )
 def test_a_view_reads_like_the_file(
     tmp_path_factory: pytest.TempPathFactory,
+    system: None,
     size: int,
     head: int,
     reads: list[tuple[int, int]],

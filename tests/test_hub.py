@@ -19,6 +19,7 @@ from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.bake.verify import verify
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.files.hub import Repository, front_matter, pin_revision
+from lidar_synth.generate.loading import settle_model
 from lidar_synth.geometry.sensor import load_sensor
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
@@ -151,6 +152,20 @@ def test_a_bake_names_the_commit_of_its_model(
     assert plan.job.model == url
     bake(plan, progress=False)
     assert Bank(tmp_path / "bank")[2].id == "tiny/0/2"
+
+
+def test_a_model_in_the_cache_is_named_by_its_commit(
+    hub: Hub, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the hub does not answer."""
+    from huggingface_hub import constants
+
+    url = load_generator(model).push_to_hub("me/tiny")
+    found = settle_model("hf://me/tiny")
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    assert found == settle_model("hf://me/tiny") == settle_model(url) == url
+    with pytest.raises(FileError, match="hf://me/other"):
+        settle_model("hf://me/other")
 
 
 # Banks

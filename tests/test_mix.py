@@ -1,5 +1,6 @@
 """The one door: two sources to batches, epochs that follow one another, resumption."""
 
+import warnings
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,19 @@ def test_a_pass_that_is_left_early_is_begun_again() -> None:
     assert loader.epoch == 1
 
 
+@WORKERS
+def test_short_passes_over_the_same_batches_are_warned_about(workers: int) -> None:
+    loader = mixture().loader(batch_size=4, num_workers=workers)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "epoch . begins again")
+        next(iter(loader))
+        for epoch in range(2):
+            loader.set_epoch(epoch)
+            ids(islice(loader, 2))
+        with pytest.raises(UserWarning, match=r"epoch 1 .* set_epoch.* epoch_size=N"):
+            next(iter(loader))
+
+
 def test_a_pass_of_counted_batches_is_followed_by_the_next_epoch() -> None:
     loader = mixture().loader(batch_size=4)
     for epoch in range(3):
@@ -149,6 +163,12 @@ def test_the_epoch_of_the_mixture_counts() -> None:
 def test_bad_sizes_are_refused() -> None:
     with pytest.raises(ConfigError, match="batch_size=0"):
         mixture().loader(batch_size=0)
+
+
+def test_batches_in_another_order_are_refused() -> None:
+    """A state counts batches: it would resume after others than those that came."""
+    with pytest.raises(ConfigError, match="in_order=False; expected batches in"):
+        mixture().loader(batch_size=4, num_workers=2, in_order=False)
 
 
 def test_the_names_of_the_package_are_shown() -> None:

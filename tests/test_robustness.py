@@ -95,6 +95,10 @@ def test_predictions_in_files_score_as_the_function_that_made_them(
 ) -> None:
     assert write_cases(scans, tmp_path / "out", LOSSES) == 2 * 7
     assert write_cases(scans, tmp_path / "out", LOSSES) == 0
+    for others, seed in ((scans, 1), (scans[::-1], 0), (scans[:1], 0)):
+        with pytest.raises(ConfigError, match="out was filled with"):
+            write_cases(others, tmp_path / "out", LOSSES, seed)
+    assert write_cases(scans, tmp_path / "out", ["motion_blur"]) == 2 * 3
     ids = np.full(256, 0, "<u4")
     ids[[8, 12]] = 40, 50  # SemanticKITTI's road and building
     for case in cases(LOSSES):

@@ -38,7 +38,7 @@ class BakePlan:
     any process.
 
     Args:
-        out: the bank's folder, or its URL.
+        out: the bank's folder, absolute, or its URL.
         job: the settings, with ``batch``, ``fields`` and ``shard_size`` resolved and the path of a
             checkpoint file and of a local dataset of conditions made absolute.
         facts: the facts of the bank.
@@ -110,7 +110,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
             f"scans up to index {job.first + job.count}", "less than 2^63"
         )
     generator = load_generator(job.model, columns=job.columns)
-    condition = _settle_path(job.condition)
+    condition = job.condition and _settle_path(job.condition)
     source = conditions_for(
         generator, condition, job.condition_layout, job.condition_split
     )
@@ -160,12 +160,13 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
         compression=job.compression,
         layout=job.layout,
     )
-    return BakePlan(bank_root(out), resolved, facts)
+    # Absolute, as actors of Ray work in other folders.
+    return BakePlan(bank_root(_settle_path(out)), resolved, facts)
 
 
-def _settle_path(path: str | None) -> str | None:
-    """The path of a dataset from any folder."""
-    return path if path is None or is_url(path) else str(Path(path).resolve())
+def _settle_path(path: str | Path) -> str:
+    """The path of a bank or a dataset from any folder, or its URL."""
+    return str(path if is_url(path) else Path(path).resolve())
 
 
 def _fields(job: BakeJob, generated: frozenset[str]) -> tuple[str, ...]:

@@ -53,7 +53,9 @@ def bake_in_processes(
         while any(worker.is_alive() for worker in workers):
             for worker in workers:
                 worker.join(_POLL / len(workers))
-            reported += _report(progress, sum(scans) - reported)
+            made = sum(scans)
+            progress(made - reported)
+            reported = made
             if not errors.empty():
                 raise errors.get()
             if killed := [
@@ -67,7 +69,7 @@ def bake_in_processes(
                 )
         if not errors.empty():
             raise errors.get()
-        _report(progress, sum(scans) - reported)
+        progress(sum(scans) - reported)
     finally:
         stop.value = 1
         # skips workers that were not started
@@ -75,12 +77,6 @@ def bake_in_processes(
             worker.join(_PATIENCE)
             worker.kill()  # it may wait for a lock that a killed worker held
             worker.join()
-
-
-def _report(progress: Progress, scans: int) -> int:
-    if scans:
-        progress(scans)
-    return scans
 
 
 def _work(

@@ -20,7 +20,7 @@ from lidar_synth.bake.ray_actors import bake_on_ray
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress
 from lidar_synth.bake.slurm import bake_on_slurm
-from lidar_synth.bake.torchrun import bake_under_torchrun
+from lidar_synth.bake.torchrun import take_part
 from lidar_synth.bank import Index
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.devices import check_device
@@ -32,7 +32,7 @@ ENGINES: dict[str, Engine] = {
     "processes": bake_in_processes,
     "ray": bake_on_ray,
     "slurm": bake_on_slurm,
-    "torchrun": bake_under_torchrun,
+    "torchrun": bake_local,  # its part of the shards
 }
 """Engines by name; each of them runs ``bake_shard``."""
 
@@ -95,6 +95,8 @@ def bake(
     with _terminated_as_interrupted(), _releasing(plan):
         with at_work(plan):
             mine = range(len(plan.shards))[share.index :: share.of]
+            if engine == "torchrun":
+                mine = take_part(plan, mine)
             checked = tqdm(
                 mine,
                 "checking existing shards",
@@ -104,10 +106,12 @@ def bake(
                 delay=2,
             )
             missing = find_missing(plan, checked)
-            scans = sum(plan.shards[number].scans for number in missing)
             if missing:
                 with tqdm(
-                    total=scans, unit="scan", smoothing=0.05, disable=not progress
+                    total=sum(plan.shards[number].scans for number in missing),
+                    unit="scan",
+                    smoothing=0.05,
+                    disable=not progress,
                 ) as bar:
                     run(plan, missing, resources, bar.update)
         return finish(plan)

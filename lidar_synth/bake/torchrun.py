@@ -1,23 +1,20 @@
-"""Engine ``torchrun``: one of the processes that ``torchrun`` starts; each takes every n-th shard.
+"""Engine ``torchrun``: one of the processes that ``torchrun`` starts; each takes every n-th shard
+of the run's share.
 
 The processes do not communicate: the one that finishes last writes the index.
 """
 
 import os
-from collections.abc import Sequence
 
 import torch
 
 from lidar_synth.bake.job import BakePlan
-from lidar_synth.bake.resources import Resources
-from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError
 
 
-def bake_under_torchrun(
-    plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress
-) -> None:
-    """Write this process's shards.
+def take_part(plan: BakePlan, numbers: range) -> range:
+    """This process's part of the shards of a run, finished or not: the list of missing shards may
+    differ between processes. Its GPU becomes the current one.
 
     Raises:
         ConfigError: if torchrun did not start this process.
@@ -34,7 +31,4 @@ def bake_under_torchrun(
         ) from error
     if plan.job.device == "cuda":
         torch.cuda.set_device(local)
-    # By the shard's number in the plan: the list of missing shards may differ between processes.
-    for number in numbers:
-        if number % ranks == rank:
-            bake_shard(plan, number, progress)
+    return numbers[rank::ranks]

@@ -89,7 +89,12 @@ class LocalFile:
                 f"{self._path} ends before byte {offset + size}", "a complete file"
             )
         try:
-            content = os.pread(self._descriptor, size, offset)
+            if hasattr(os, "pread"):
+                content = os.pread(self._descriptor, size, offset)
+            else:  # on Windows, where no other file can take the place of an open one
+                with self._path.open("rb") as file:
+                    file.seek(offset)
+                    content = file.read(size)
         except OSError as error:
             raise unreadable(self._path, error, "a file of a bank") from error
         if len(content) != size:
@@ -99,9 +104,8 @@ class LocalFile:
         return content
 
     def close(self) -> None:
-        if self._descriptor >= 0:
-            with suppress(OSError):
-                os.close(self._descriptor)
+        with suppress(OSError):
+            os.close(self._descriptor)
         self._descriptor = -1
 
     __del__ = close
@@ -225,7 +229,9 @@ def open_system(url: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        system, path = fsspec.core.url_to_fs(url)
+        # With the proxies that the environment names.
+        options = {"client_kwargs": {"trust_env": True}} if scheme[:4] == "http" else {}
+        system, path = fsspec.core.url_to_fs(url, **options)
         _SYSTEMS[id(system)] = system
     except ImportError as error:
         raise LibraryError(
@@ -277,14 +283,8 @@ class RangedFile(io.RawIOBase):
         return self._position
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._position = (
-            offset
-            + {
-                io.SEEK_SET: 0,
-                io.SEEK_CUR: self._position,
-                io.SEEK_END: self._file.size,
-            }[whence]
-        )
+        # SEEK_SET, SEEK_CUR and SEEK_END are 0, 1 and 2.
+        self._position = offset + (0, self._position, self._file.size)[whence]
         return self._position
 
     def readinto(self, buffer: Any) -> int:
@@ -294,7 +294,7 @@ class RangedFile(io.RawIOBase):
             OSError: if these bytes have not been read yet.
         """
         start = self._position
-        size = min(len(buffer), max(self._file.size - self._position, 0))
+        size = min(len(buffer), max(self._file.size - start, 0))
         for first, content in self._spans:
             if first <= start and start + size <= first + len(content):
                 offset = start - first

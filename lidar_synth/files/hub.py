@@ -89,7 +89,7 @@ def pin_revision(url: str) -> str:
         LibraryError: without the extra ``hub``.
     """
     there = Repository.parse(url)
-    if there.revision is not None and _COMMIT.fullmatch(there.revision):
+    if _COMMIT.fullmatch(there.revision or ""):
         return url
     with _hub_errors(url):
         from huggingface_hub import HfApi
@@ -110,16 +110,7 @@ def fetch_model(url: str) -> Path:
         DataError: unless there is one checkpoint; otherwise as ``pin_revision``.
     """
     there = Repository.parse(url)
-    with _hub_errors(url):
-        from huggingface_hub import snapshot_download
-
-        folder = snapshot_download(
-            there.name,
-            repo_type=there.kind,
-            revision=there.revision,
-            allow_patterns=there.path or "*.safetensors",
-        )
-    paths = sorted(Path(folder).glob(there.path or "*.safetensors"))
+    paths = sorted(_download(there).glob(there.path or "*.safetensors"))
     if len(paths) != 1:
         names = " and ".join(path.name for path in paths) or "no checkpoint"
         raise DataError(
@@ -128,6 +119,27 @@ def fetch_model(url: str) -> Path:
             f"Name one: {url}/FILE.safetensors.",
         )
     return paths[0]
+
+
+def pin_model(url: str) -> str:
+    """The URL of a model with the hash of the commit that ``fetch_model`` gives for it: where the
+    hub does not answer, of that in the cache. Raises as ``pin_revision``."""
+    there = Repository.parse(url)
+    return str(replace(there, revision=_download(there).name))
+
+
+def _download(there: Repository) -> Path:
+    """The folder of a commit in the hub's cache, named by its hash, with a model's checkpoints."""
+    with _hub_errors(str(there)):
+        from huggingface_hub import snapshot_download
+
+        folder = snapshot_download(
+            there.name,
+            repo_type=there.kind,
+            revision=there.revision,
+            allow_patterns=there.path or "*.safetensors",
+        )
+    return Path(folder)
 
 
 def push(

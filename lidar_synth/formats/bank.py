@@ -37,7 +37,7 @@ class BankScans(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         self.bank = Bank(root)
-        if sensor is not None and load_sensor(sensor).shape != self.bank.sensor.shape:
+        if sensor and not load_sensor(sensor).same_grid(self.bank.sensor):
             raise ConfigError(
                 f"sensor {sensor} for {root}",
                 f"{self.bank.sensor.name!r}, whose scans it holds",

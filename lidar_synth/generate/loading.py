@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from lidar_synth.errors import ConfigError, DataError, suggest
-from lidar_synth.files.hub import fetch_model, is_on_hub, pin_revision
+from lidar_synth.files.hub import fetch_model, is_on_hub, pin_model
 from lidar_synth.generate.checkpoint import (
     CODEC,
     VELOCITY,
@@ -123,9 +123,9 @@ def settle_model(model: str) -> str:
     path, or a commit of the hub.
 
     Raises:
-        FileError, LibraryError: as ``hub.pin_revision``.
+        FileError, LibraryError: as ``hub.pin_model``.
     """
     if is_on_hub(model):
-        return pin_revision(model)
+        return pin_model(model)
     path = Path(model)
     return str(path.resolve()) if path.suffix == ".safetensors" else model

@@ -202,6 +202,12 @@ class MixedBatches(Divided, Sampler[list[int]]):
         self._fetched = (0, 0)
         return self._batches(epoch, steps)
 
+    def steps_from(self, start: int) -> CutSteps:
+        """The steps of a pass that begins at a position."""
+        return cut_steps(
+            start, len(self.dataset), self.batch_size, self.world_size, self.drop_last
+        )
+
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, before iterating; see ``MixedScans.set_epoch``."""
         self.dataset.set_epoch(epoch)
@@ -271,8 +277,5 @@ class MixedBatches(Divided, Sampler[list[int]]):
         self._fetched = (before, yielded)
 
     def _steps(self) -> CutSteps:
-        epoch = self.dataset.epoch
-        start = self._start[1] if self._start[0] == epoch else 0
-        return cut_steps(
-            start, len(self.dataset), self.batch_size, self.world_size, self.drop_last
-        )
+        epoch, start = self._start
+        return self.steps_from(start if epoch == self.dataset.epoch else 0)

@@ -23,7 +23,7 @@ from lidar_synth.mixing.state import count_accelerated
 
 REPEATED = (
     "epoch {} begins again, with the same scans in the same order as before. Make the mixture "
-    "once, and call set_epoch(epoch) before each pass."
+    "once, and call set_epoch(epoch) before each pass; epoch_size=N makes short epochs."
 )
 
 SHARED_TWICE = (

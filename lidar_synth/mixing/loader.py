@@ -1,11 +1,14 @@
 """``MixedLoader``: batches of a mixture, epoch after epoch."""
 
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from torch.utils.data import DataLoader
 
-from lidar_synth.mixing.batches import MixedBatches, cut_steps
+from lidar_synth.errors import ConfigError
+from lidar_synth.mixing.batches import MixedBatches
+from lidar_synth.mixing.epochs import REPEATED
 
 
 class MixedLoader(DataLoader[Any]):
@@ -13,7 +16,8 @@ class MixedLoader(DataLoader[Any]):
 
     Each pass is one epoch, from the mixture's own or that of a loaded state on; ``set_epoch`` of
     the loader or of the mixture chooses another. A pass that is left early is begun again by the
-    next one. In a distributed training each rank gets its share.
+    next one, with a warning unless it was left after one batch: passes of some batches each would
+    train on the same ones for ever. In a distributed training each rank gets its share.
 
     Args:
         dataset: a ``MixedScans``.
@@ -23,7 +27,7 @@ class MixedLoader(DataLoader[Any]):
         options: further arguments of ``DataLoader``.
 
     Raises:
-        ConfigError: on a batch size below 1.
+        ConfigError: on a batch size below 1, or ``in_order=False``.
     """
 
     def __init__(
@@ -35,6 +39,11 @@ class MixedLoader(DataLoader[Any]):
         drop_last: bool = False,
         **options: Any,
     ) -> None:
+        if not options.get("in_order", True):
+            raise ConfigError(
+                "in_order=False",
+                "batches in the plan's order, as state_dict counts them",
+            )
         self._mixed = dataset
         self._batches: MixedBatches = dataset.batches(batch_size, drop_last=drop_last)
         # Its epoch, and number of its batches done.
@@ -58,19 +67,13 @@ class MixedLoader(DataLoader[Any]):
     def __len__(self) -> int:
         """Number of batches in a complete epoch, also while one is resumed: trainers ask for it
         once, and Lightning adds the batches before a checkpoint to its count."""
-        batches = self._batches
-        return len(
-            cut_steps(
-                0,
-                len(self._mixed),
-                batches.batch_size,
-                batches.world_size,
-                batches.drop_last,
-            )
-        )
+        return len(self._batches.steps_from(0))
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
         epoch = self.epoch
+        begun, done = self._pass
+        if begun == epoch and done > 1:  # after one, a user has looked at it
+            warnings.warn(REPEATED.format(epoch), stacklevel=2)
         self.set_epoch(epoch)
         # Counted before each batch is yielded: a loop that takes as many batches as there are never
         # asks for the end of the pass.

@@ -19,11 +19,12 @@ from tqdm import tqdm
 
 from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, choose
-from lidar_synth.files.disk import read_values
+from lidar_synth.files.claims import claim
+from lidar_synth.files.disk import hash_of_names, read_values
 from lidar_synth.files.parsing import read_facts
 from lidar_synth.formats.point_labels import decode_labels
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry.scan import Scan, Source, scan_hash
 from lidar_synth.lab.evaluate.segmentation import load_judge, mean_iou
 from lidar_synth.lab.evaluate.street_judge import load_archive
 from lidar_synth.noise import keyed_rng
@@ -179,9 +180,13 @@ def write_cases(
         Number of scans written.
 
     Raises:
-        ConfigError, DataError: as ``stress``.
+        ConfigError, DataError: as ``stress``; a ConfigError also on a folder with other scans, or
+            with those of another seed.
         FileError: if a folder cannot be written.
     """
+    given = hash_of_names(map(scan_hash, corrupt(scans, "clean")))
+    # Without the corruptions: others may be added.
+    claim(out / ".stress.json", {"seed": seed, "scans": given})
     written = 0
     for case in tqdm(cases(corruptions), unit="case", disable=None):
         writer = SemanticKITTIWriter(out / case)
