@@ -137,6 +137,7 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
         ({"channels": ["range", "colour"]}, "colour"),
         ({"time_grid": [1.0, 0.5]}, "time grid"),
         ({"time_grid": [1.0, 0.2, 0.6, 0.0]}, "time grid"),
+        ({"time_grid": [10**400, 0.0]}, "header with invalid values"),
         ({"provenance": {"data": "town"}}, "without data_licence, licence"),
         ({"networks": {}}, "networks"),
         (

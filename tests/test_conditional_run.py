@@ -26,15 +26,17 @@ from PIL import Image
 
 from lidar_synth.bake.conditions import conditions_for
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.formats import WRITERS
+from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.checkpoint import (
     ENCODER,
     VELOCITY,
     load_checkpoint,
+    save_checkpoint,
 )
+from lidar_synth.generate.conditions import CONDITIONS, bridge_gaps
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.lab.town import Town
-from lidar_synth.lab.train.config import DistillConfig, load_config
+from lidar_synth.lab.train.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.lab.train.runs import open_stage
 
 TRANSFORMER = {
@@ -48,6 +50,7 @@ TRANSFORMER = {
         "window": [3, 3],
     },
 }
+PIXEL = TRANSFORMER | {"arguments": TRANSFORMER["arguments"] | {"patch": [2, 2]}}
 
 
 CAMERA = {
@@ -77,14 +80,13 @@ SIGHT = CAMERA | {
 
 def test_a_pixel_model_of_label_maps(scans: Path, tmp_path: Path) -> None:
     """The condition does not care for the codec."""
-    network = TRANSFORMER | {"arguments": TRANSFORMER["arguments"] | {"patch": [2, 2]}}
     call(
         "train",
         write_config(
             scans,
             tmp_path,
             "pixel",
-            network=network,
+            network=PIXEL,
             condition=SEMANTIC,
             channels=["range"],
             steps=3,
@@ -94,6 +96,30 @@ def test_a_pixel_model_of_label_maps(scans: Path, tmp_path: Path) -> None:
     [scan] = generator.scans(0, [0], random_scan(SENSOR, 400, 1))
     assert generator.fields == {"label", "confidence"}
     assert scan.label is not None
+
+
+def test_gaps_stay_in_label_maps_where_the_model_has_learnt_them(
+    scans: Path, tmp_path: Path
+) -> None:
+    given = {"network": PIXEL, "condition": SEMANTIC, "channels": ["range"]}
+    data = {"town": 1, "path": None}
+    config = write_config(scans, tmp_path, "town", data=data, **given)
+    town = open_stage(load_config(TrainConfig, config))
+    assert "keep_gaps" not in town.header.conditioning["semantic"]
+    start = tmp_path / "start.safetensors"
+    save_checkpoint(start, town.header, town.parts(town.network))
+    source = open_scans(scans / "scans")
+    for init in (None, str(start)):
+        config = write_config(scans, tmp_path, f"of-{init is None}", init=init, **given)
+        stage = open_stage(load_config(TrainConfig, config))
+        data = stage.open_data()
+        shown = data.conditions(range(5)).numpy()
+        options = stage.header.conditioning["semantic"]
+        for i, seen in zip(data.scans_at(range(5)), shown, strict=True):
+            sensor = stage.header.sensor
+            read = CONDITIONS["semantic"].read(source[i], sensor, seen.shape, options)
+            assert np.array_equal(read, seen)
+            assert not np.array_equal(seen, bridge_gaps(seen))
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +154,7 @@ def test_a_latent_transformer(
 
     # The start of a conditional model: until it has learnt to look, it generates what it did.
     data = {"path": str(kitti), "layout": "kitti360", "split": "all"}
+    data |= {"flip": condition is not SIGHT}
     config = write_config(
         kitti,
         tmp_path,
@@ -192,8 +219,33 @@ def test_a_camera_model(
         0, [0], replace(random_scan(SENSOR, 400, 0), image_path=images[0])
     )
     assert np.allclose(scan.points, same.points)
-    with pytest.raises(ConfigError, match="roll=True with the condition 'camera'"):
-        call("train", config, "data.roll=true", f"output={tmp_path / 'rolled'}")
+    model = tmp_path / "camera" / "camera.safetensors"
+    student = ["distill", write_config(scans, tmp_path, "few", teacher=str(model))]
+    held = "held_out={data: {town: 1, licence: MIT, roll: 90}}"
+    for arguments, message in (
+        (["train", config, "data.roll=true"], "data.roll=True"),
+        (["train", config, "data.flip=both"], "data.flip=both"),
+        (["train", config, held], "data.roll=90.0"),
+        ([*student, "data.roll=true"], "data.roll=True"),
+    ):
+        with pytest.raises(
+            ConfigError, match=f"{message}.* with the condition 'camera'"
+        ):
+            call(*arguments, f"output={tmp_path / 'turned'}")
+
+
+def test_scans_are_not_mirrored_for_an_encoder_that_uses_the_calibration(
+    scans: Path, kitti: Path, tmp_path: Path
+) -> None:
+    data = {"path": str(kitti), "layout": "kitti360", "split": "all"}
+    given = {"network": PIXEL, "condition": SIGHT, "data": data}
+    config = write_config(scans, tmp_path, "sight", **given)
+    with pytest.raises(
+        ConfigError,
+        match="data.flip=True.* encoder 'sight'; expected .*data.flip=false",
+    ):
+        open_stage(load_config(TrainConfig, config)).open_data()
+    open_stage(load_config(TrainConfig, config, ["data.flip=false"])).open_data()
 
 
 @pytest.mark.slow

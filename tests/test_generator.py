@@ -492,10 +492,17 @@ def test_a_drawn_hole_leaves_what_surrounds_it_on_the_grid_of_the_training() -> 
     [image] = whole.range_images(seed=0, indices=[0], steps=1)
     hole = (image.range > 10) & (image.range < 15)
     bare = RangeImage(image.range, image.sensor)
-    [drawn] = inpaint(generator, [bare], [hole], seed=1, indices=[0])
+    labels = image.channels["label"]
+    labelled = RangeImage(image.range, image.sensor, {"label": labels})
+    drawn, other = inpaint(
+        generator, [bare, labelled], [hole, hole], seed=1, indices=[0, 0]
+    )
     assert (drawn.channels["label"][~hole] == IGNORE).all()
-    assert not drawn.channels["reflectance"][~hole].any()
+    for name in ("reflectance", "confidence"):
+        assert not drawn.channels[name][~hole].any()
     assert (drawn.channels["label"][hole & drawn.mask] != IGNORE).any()
+    known = labels[~hole] != IGNORE
+    assert np.array_equal(other.channels["confidence"][~hole], known)
     narrow = r"\(64 x 1024\) for a model of .*\(64 x 2048\)"
     with pytest.raises(DataError, match=narrow):
         check_model(generator, generator.sensor)

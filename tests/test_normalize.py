@@ -161,7 +161,7 @@ def test_invalid_tensors_and_formats_are_refused() -> None:
 
 
 @pytest.mark.parametrize("key", ["range_min", "range_max", "scale", "offset"])
-@pytest.mark.parametrize("value", ["x", math.nan, math.inf, -1.0, [1], 10**400])
+@pytest.mark.parametrize("value", ["x", math.nan, math.inf, -1.0, [1], 10**400, True])
 def test_impossible_numbers_are_refused(key: str, value: Any) -> None:
     with pytest.raises(ConfigError):
         Normalisation(

@@ -16,6 +16,7 @@ from lidar_synth.generate.checkpoint import (
     save_checkpoint,
 )
 from lidar_synth.generate.loading import find_model
+from lidar_synth.geometry.sensor import sensor_yaml
 from lidar_synth.lab.cli.train import distill
 from lidar_synth.lab.evaluate.leakage import overlap, town
 from lidar_synth.lab.train import (
@@ -112,6 +113,45 @@ def test_a_student_goes_on_with_the_latents_of_its_teacher_alone(
             continue
         with pytest.raises(ConfigError, match="init town with another autoencoder"):
             student(tmp_path, path, "init=town")
+
+
+def test_a_student_that_is_trained_further_keeps_its_own_networks(
+    tmp_path: Path,
+) -> None:
+    town = load_checkpoint(find_model("town"))
+    held = town.header.networks["velocity"]
+    other = held._replace(arguments=held.arguments | {"window": [3, 5]})
+    header = replace(town.header, networks=town.header.networks | {"velocity": other})
+    path = tmp_path / "start.safetensors"
+    save_checkpoint(path, header, town.networks)
+    stage = student(tmp_path, TEACHER, f"init={path}")
+    assert stage.header.networks == header.networks
+    assert stage.network.window == (3, 5)
+
+
+def test_times_of_autoguidance_need_a_weaker_teacher(tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"within \(0.1, 0.9\) without weaker; expected weaker="
+    ):
+        student(tmp_path, TEACHER, "within=[0.1, 0.9]")
+
+
+def test_ranges_that_are_not_learnt_are_told_and_not_those_of_the_model(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    tiny = open_networks(load_config(TrainConfig, "town_tiny"))[1].sensor
+    assert not recwarn
+    path = tmp_path / "mine.yaml"
+    path.write_text(sensor_yaml(replace(tiny, range_min=0.5, range_max=200.0)))
+    given = [f"sensor={path}"]
+    far = "from 0.5 to 200 m: only returns from 1.45 to 80 m are learnt.*'r2flow'"
+    with pytest.warns(UserWarning, match=far):
+        networks, header = open_networks(load_config(TrainConfig, "town_tiny", given))
+    assert header.sensor == tiny
+    start = tmp_path / "start.safetensors"
+    save_checkpoint(start, header, networks)
+    given.append(f"init={start}")
+    assert open_networks(load_config(TrainConfig, "town_tiny", given))[1].sensor == tiny
 
 
 def config(folder: Path, chosen: str) -> TrainConfig:

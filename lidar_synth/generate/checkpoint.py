@@ -197,7 +197,7 @@ class Header:
             raise ConfigError(
                 f"a header without {error}", "all keys of the format"
             ) from error
-        except (TypeError, AttributeError) as error:
+        except (TypeError, AttributeError, OverflowError) as error:
             raise ConfigError(
                 f"a header with invalid values ({error})", "the values of the format"
             ) from error

@@ -20,7 +20,6 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.flow.solvers import mean_velocity, solve
 from lidar_synth.generate.generator import Generator
-from lidar_synth.geometry.normalize import CHANNELS
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.noise import gaussian, uniform
@@ -43,7 +42,7 @@ def inpaint(
     Args:
         generator: an unconditional model.
         images: B images on the model's grid with provisional content in the holes. Missing labels
-            are ignored ones, missing reflectance is 0.
+            are ignored ones, missing reflectance is 0, missing confidence 1 where there is a label.
         holes: (H, W) each, True for cells to draw.
         seed: seed of the noise, 0 <= seed < 2^64.
         indices: B indices of the noise, 0 <= index < 2^63.
@@ -134,8 +133,7 @@ def _batch(
         images, holes, generator.tensors.to_images(state, sensor), strict=True
     ):
         channels = {
-            n: np.where(hole, v, image.channels.get(n, v))
-            for n, v in new.channels.items()
+            n: np.where(hole, v, image.channels[n]) for n, v in new.channels.items()
         }
         results.append(
             RangeImage(np.where(hole, new.range, image.range), image.sensor, channels)
@@ -162,10 +160,12 @@ def _sample(
 
 
 def _complete(image: RangeImage) -> RangeImage:
-    """The image with every channel that a model may have."""
-    empty: dict[str, NDArray[Any]] = {
+    """The image with every channel that a model may give."""
+    unknown = np.full(image.range.shape, IGNORE, np.uint8)
+    label = image.channels.get("label", unknown)
+    every: dict[str, NDArray[Any]] = {
         "reflectance": np.zeros(image.range.shape, np.float32),
-        "label": np.full(image.range.shape, IGNORE, np.uint8),
+        "label": label,
+        "confidence": (label != IGNORE).astype(np.float32),
     }
-    assert set(empty) | {"range"} == set(CHANNELS)
-    return RangeImage(image.range, image.sensor, empty | image.channels)
+    return RangeImage(image.range, image.sensor, every | image.channels)

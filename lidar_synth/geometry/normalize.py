@@ -67,6 +67,7 @@ class Normalisation:
         )
         if (
             not all(isinstance(n, int | float) and abs(n) < 1e30 for n in numbers)
+            or any(isinstance(n, bool) for n in numbers)
             or min(numbers[2:]) <= 0
         ):
             raise ConfigError(

@@ -47,7 +47,7 @@ raise a ``ConfigError`` on a grid or a number of steps that they do not support:
   sample. For ``reflow``, u is the time t itself, possibly after one of ``flow.TIMESTEPS`` (R2Flow:
   ``u_shaped``).
 - grid: N + 1 descending times from 1 to 0, the student's time grid.
-- steps: Euler steps of the teacher over the part that it integrates: an interval, or all of [1, 0].
+- steps: Euler steps of the teacher in an interval; from noise to data, it takes N times as many.
 - cond: the condition, passed to the teacher.
 """
 
@@ -120,7 +120,7 @@ def reflow(
 ) -> Example:
     """Flow matching on pairs of noise and the data that the teacher generates from it, with t
     uniform in [0, 1]."""
-    return _straight(teacher, y1, u, steps, cond)
+    return _straight(teacher, y1, u, grid, steps, cond)
 
 
 def timestep_distillation(
@@ -141,7 +141,7 @@ def timestep_distillation(
     """
     _check_uniform(grid)
     start, _ = _bounds(interval_of(u, grid), grid, u)
-    return _straight(teacher, y1, start, steps, cond)
+    return _straight(teacher, y1, start, grid, steps, cond)
 
 
 def every_piece(
@@ -258,9 +258,16 @@ def _slope(
 
 
 def _straight(
-    teacher: Velocity, y1: Tensor, t: Tensor, steps: int, cond: Any
+    teacher: Velocity,
+    y1: Tensor,
+    t: Tensor,
+    grid: Sequence[float],
+    steps: int,
+    cond: Any,
 ) -> Example:
     """The example at t on the straight line from noise to the teacher's data."""
+    # The piecewise strategies follow the teacher through all intervals as finely.
+    steps *= len(grid) - 1
     slope = _slope(teacher, y1, torch.ones_like(t), torch.zeros_like(t), steps, cond)
     return Example(y1 + per_sample(t - 1, y1) * slope, t, slope, steps * len(y1))
 

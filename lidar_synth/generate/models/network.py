@@ -72,10 +72,12 @@ class Encoder(Network):
             ``generate.conditions.CONDITIONS``.
         argument: the velocity network's argument that takes ``channels``: "condition_channels" for
             maps on the grid of the state, "context_channels" for tokens.
+        mirrors: whether a mirrored condition is encoded as that of a mirrored scan.
         channels: number of channels of the maps or tokens.
     """
 
     derived_arguments: ClassVar[tuple[str, ...]] = ()
+    mirrors: ClassVar[bool] = True
     condition: ClassVar[str]
     argument: ClassVar[str]
     channels: int

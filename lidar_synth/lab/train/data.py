@@ -82,9 +82,6 @@ class Batches:
         latents: (N, 2, *codec.shape) encoded scans and mirrored scans (``cache_latents``), in place
             of ``codec``.
         conditioning: the field of the cache that is the condition; None = unconditional.
-
-    Raises:
-        ConfigError: on samples that turn, with a condition that cannot be turned.
     """
 
     cache: ImageCache
@@ -96,18 +93,6 @@ class Batches:
     codec: Codec | None = None
     conditioning: Conditioning | None = None
     latents: NDArray[np.float16] | None = None
-
-    def __post_init__(self) -> None:
-        if (
-            self.turn
-            and self.conditioning
-            and not CONDITIONS[self.conditioning.name].turns
-        ):
-            raise ConfigError(
-                f"flip={self.flip}, roll={self.roll} with the condition "
-                f"{self.conditioning.name!r}",
-                "roll=false and no flip=both: it does not turn",
-            )
 
     @property
     def turn(self) -> bool:

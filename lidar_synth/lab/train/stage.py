@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import (
     CODEC,
     ENCODER,
@@ -128,10 +129,14 @@ class Stage:
         ranks: Ranks = ALONE,
     ) -> Batches:
         """The batches of the run, or of other ``data``; the scans are projected once, by all
-        ``ranks`` together, and cached, in a ``folder`` of the run where the data names none."""
+        ``ranks`` together, and cached, in a ``folder`` of the run where the data names none.
+
+        Raises:
+            ConfigError: on scans that are mirrored or turned, with a condition that cannot be.
+        """
         given = self.config.data if data is None else data
         sensor = self.header.sensor
-        conditions = [self._condition(name) for name in self.header.conditioning]
+        conditions = [self._condition(name, given) for name in self.header.conditioning]
         source = given.open(sensor)
         channels = set(self.header.channels)
         others: dict[str, Other] = {}
@@ -173,10 +178,17 @@ class Stage:
         )
         return replace(batches, latents=latents)
 
-    def _condition(self, name: str) -> Conditioning:
+    def _condition(self, name: str, data: Data) -> Conditioning:
         """How samples get their conditions."""
         options = self.header.conditioning[name]
         encoder = self.parts(self.network)[ENCODER]
+        turned = (data.roll or data.flip == "both") and not CONDITIONS[name].turns
+        if turned or (data.flip and not encoder.mirrors):
+            raise ConfigError(
+                f"data.flip={data.flip}, data.roll={data.roll} with the condition {name!r}, "
+                f"encoder {self.header.networks[ENCODER].architecture!r}",
+                "data.roll=false, data.flip=false (true without a calibration)",
+            )
         less = options.get("view_dropout", 0.0) or options.get("outline_dropout", 0.0)
         blank = None
         if isinstance(encoder, ClipViewEncoder):

@@ -2,6 +2,7 @@
 will come of it."""
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network, network_class
+from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.train.config import (
     ConditionSection,
@@ -53,8 +55,16 @@ def fresh_networks(config: TrainConfig) -> Opened:
     """New networks and the header that describes them."""
     provenance = provenance_of(config)
     if config.codec is None:
-        sensor = load_sensor(config.sensor)
+        whole = load_sensor(config.sensor)
         tensors = config.tensors()
+        sensor = limit_ranges(whole, tensors.normalisation)
+        if sensor != whole:
+            warnings.warn(
+                f"sensor {whole.name!r} from {whole.range_min:g} to {whole.range_max:g} m: only "
+                f"returns from {sensor.range_min:g} to {sensor.range_max:g} m are learnt, those of "
+                f"the normalisation {config.normalisation!r}",
+                stacklevel=2,
+            )
         fixed = {}
         state = (tensors.size, *sensor.shape)
     else:
@@ -77,6 +87,23 @@ def fresh_networks(config: TrainConfig) -> Opened:
         conditioning=_conditioning(config.condition),
     )
     return _build(config, parts, sensor, state), header
+
+
+def limit_ranges(sensor: Sensor, normalisation: Normalisation) -> Sensor:
+    """A sensor with the ranges that a normalisation holds.
+
+    Raises:
+        ConfigError: if they have nothing in common.
+    """
+    near = max(sensor.range_min, normalisation.range_min)
+    far = min(sensor.range_max, normalisation.range_max)
+    if near >= far:
+        raise ConfigError(
+            f"sensor {sensor.name!r} from {sensor.range_min} to {sensor.range_max} m",
+            f"some of {normalisation.range_min} to {normalisation.range_max} m, "
+            "the model's ranges",
+        )
+    return replace(sensor, range_min=near, range_max=far)
 
 
 def _load_codec(path: Path) -> Checkpoint:
@@ -266,7 +293,9 @@ def _check_held(
         "normalisation": header.normalisation.to_dict(),
     }
     asked: dict[str, Any] = {
-        "sensor": load_sensor(config.sensor).to_dict(),
+        "sensor": limit_ranges(
+            load_sensor(config.sensor), header.normalisation
+        ).to_dict(),
         "channels": config.channels,
         "normalisation": config.tensors().normalisation.to_dict(),
     }

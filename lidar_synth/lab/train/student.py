@@ -16,7 +16,6 @@ from lidar_synth.generate.checkpoint import (
     Header,
     join,
     load_checkpoint,
-    network_hash,
 )
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, blank
 from lidar_synth.generate.flow.distill import STRATEGIES, every_piece
@@ -98,7 +97,7 @@ class StudentStage(Stage):
         start = load_checkpoint(find_model(config.init or config.teacher))
         networks = start.networks
         if config.init is not None:
-            header = _add_times(config, header, teacher, start)
+            header = _take_start(config, header, teacher, start)
         if config.also:
             header = _add_ends(config, networks, header)
             self.loss = balanced_velocity_loss
@@ -155,19 +154,16 @@ def _check_teacher(config: DistillConfig, teacher: Checkpoint) -> None:
         )
 
 
-def _add_times(
+def _take_start(
     config: DistillConfig, header: Header, teacher: Checkpoint, start: Checkpoint
 ) -> Header:
-    """Take the times of a student that is trained further.
+    """Take the networks and the times of a student that is trained further.
 
     Raises:
         ConfigError: if it is the student of another kind of teacher, of one on other latents, or of
             other numbers of steps.
     """
-    shared = ("sensor", "channels", "normalisation", "conditioning")
-    differs = [k for k in shared if getattr(header, k) != getattr(start.header, k)]
-    if not _same_latents(teacher, start):
-        differs.append("autoencoder")
+    differs = _differences(teacher, start)
     grids = (start.header.time_grid, *start.header.other_grids)
     intervals = [len(grid) - 1 for grid in grids]
     wanted = [config.intervals, *config.also]
@@ -180,10 +176,18 @@ def _add_times(
     made = {"init": start.hash, "init_provenance": start.header.provenance}
     return replace(
         header,
+        networks=start.header.networks,
         time_grid=grids[0],
         other_grids=grids[1:],
         provenance=header.provenance | made,
     )
+
+
+def _differences(one: Checkpoint, other: Checkpoint) -> list[str]:
+    """Which of what decides the states and the conditions of a flow differs between two models."""
+    shared = ("sensor", "channels", "normalisation", "conditioning")
+    found = [k for k in shared if getattr(one.header, k) != getattr(other.header, k)]
+    return found if _same_latents(one, other) else [*found, "autoencoder"]
 
 
 def _same_latents(one: Checkpoint, other: Checkpoint) -> bool:
@@ -235,12 +239,17 @@ def target_flow(
         device: of the training.
 
     Raises:
-        ConfigError: on classifier-free guidance of a teacher without dropout of its condition, or a
-            weaker model of other data.
+        ConfigError: on classifier-free guidance of a teacher without dropout of its condition or
+            within some times only, or a weaker model of other data.
     """
     made = {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
     velocity = _frozen_flow(teacher, config)
     if config.weaker is None:
+        if config.within != (0, 1):
+            raise ConfigError(
+                f"within {config.within} without weaker",
+                "weaker=CHECKPOINT: within is of autoguidance",
+            )
         return _from_blank(config, teacher, velocity), made
     weaker = load_checkpoint(config.weaker, device)
     _check_weaker(config, teacher, weaker)
@@ -300,22 +309,7 @@ def _check_weaker(
         )
     if VELOCITY not in weaker.networks:
         raise ConfigError(f"{given}, an autoencoder", "a model that generates")
-    kinds = [_states_of(weaker), _states_of(teacher)]
-    differs = [key for key in kinds[0] if kinds[0][key] != kinds[1][key]]
-    if differs:
+    if differs := _differences(teacher, weaker):
         raise ConfigError(
             f"{given} of another {', '.join(differs)}", f"those of {config.teacher}"
         )
-
-
-def _states_of(checkpoint: Checkpoint) -> dict[str, Any]:
-    """What decides the states and the conditions of a flow."""
-    header = checkpoint.header
-    codec = checkpoint.networks.get(CODEC)
-    return {
-        "sensor": header.sensor,
-        "channels": header.channels,
-        "normalisation": header.normalisation,
-        "conditioning": header.conditioning,
-        "autoencoder": None if codec is None else network_hash(codec),
-    }

@@ -47,6 +47,7 @@ class SightEncoder(Encoder):
     needs_ray_angles: ClassVar[bool] = True
     condition: ClassVar[str] = "camera"
     argument: ClassVar[str] = "condition_channels"
+    mirrors: ClassVar[bool] = False  # the calibration is that of images as they are
 
     def __init__(
         self,

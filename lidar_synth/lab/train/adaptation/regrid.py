@@ -6,7 +6,6 @@ the table of positions, whose columns wrap around. Ray angles are those of the n
 model generates no good scans until it has been trained.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -28,6 +27,7 @@ from lidar_synth.generate.checkpoint import (
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.train.start import limit_ranges
 
 ANGLES = "angles.cells"
 """Ray angles of the cells of the state, which are replaced."""
@@ -69,16 +69,8 @@ def fit_grid(sensor: Sensor, header: Header) -> Sensor:
             f"sensor {sensor.name!r} with {sensor.shape[0]} rows",
             f"a multiple of {rows} rows",
         )
-    near = max(sensor.range_min, header.normalisation.range_min)
-    far = min(sensor.range_max, header.normalisation.range_max)
-    if near >= far:
-        raise ConfigError(
-            f"sensor {sensor.name!r} from {sensor.range_min} to {sensor.range_max} m",
-            f"some of {header.normalisation.range_min} to {header.normalisation.range_max} m, "
-            "the model's ranges",
-        )
     wanted = columns * max(1, round(sensor.columns / columns))
-    return replace(sensor, columns=wanted, range_min=near, range_max=far)
+    return replace(limit_ranges(sensor, header.normalisation), columns=wanted)
 
 
 def unit_of(header: Header) -> tuple[int, int]:
@@ -213,11 +205,3 @@ def _along(
         weight.index_select(axis, torch.from_numpy(i)) for i in (first, second)
     )
     return torch.lerp(one, other, share)
-
-
-def attach_codec(
-    flow: Mapping[str, nn.Module], codec: Mapping[str, nn.Module]
-) -> dict[str, nn.Module]:
-    """The flow of one model, with what encodes its condition, and the autoencoder of another
-    one."""
-    return {**flow, CODEC: codec[CODEC]}

@@ -21,7 +21,6 @@ from lidar_synth.generate.loading import find_model
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.train.adaptation.card import figures, provenance_of, write_card
 from lidar_synth.lab.train.adaptation.regrid import (
-    attach_codec,
     check_movable,
     fit_grid,
     regrid,
@@ -291,7 +290,7 @@ def _with_codec(work: Work, name: str, flow: Path, codec: Path) -> Path:
         save_checkpoint(
             path,
             replace(one.header, provenance=provenance),
-            attach_codec(one.networks, other.networks),
+            one.networks | {CODEC: other.networks[CODEC]},
         )
     return path
 

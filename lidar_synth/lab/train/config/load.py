@@ -10,7 +10,6 @@ from pydantic import BaseModel
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.files.recipes import find_recipe, merge, read_recipe, validate
-from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.generate.flow.solvers import read_grid
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.train.config.sections import Run
@@ -118,16 +117,6 @@ def _check_train(config: TrainConfig) -> None:
         raise ConfigError(
             "decoder without init, or with a codec or a condition",
             "init: a latent model, with its own ones",
-        )
-    if (
-        (config.data.roll or config.data.flip == "both")
-        and config.condition
-        and not CONDITIONS[config.condition.kind].turns
-    ):
-        raise ConfigError(
-            f"data.flip={config.data.flip}, data.roll={config.data.roll} with the condition "
-            f"{config.condition.kind!r}",
-            "data.roll=false and no data.flip=both",
         )
     if config.codec is not None and config.recipe.weights:
         raise ConfigError(

@@ -209,7 +209,7 @@ class ConditionSection(Section):
         focal: focal length of the camera in pixels, which the dataset's calibration has to confirm.
         views: views side by side in the image that are resized one by one, as in LiDM.
         keep_gaps: whether narrow gaps in label maps are kept when a scan is generated, as they are
-            in training.
+            in training; those of a model trained on ``data.path`` always are.
     """
 
     kind: Literal["semantic", "camera", "layout"]
@@ -247,17 +247,5 @@ class ConditionSection(Section):
 
     def options(self) -> dict[str, Any]:
         """What the checkpoint's header says about it."""
-        values = self.model_dump(
-            mode="json",
-            include={
-                "dropout",
-                "view_dropout",
-                "outline_dropout",
-                "height",
-                "image",
-                "focal",
-                "views",
-                "keep_gaps",
-            },
-        )
+        values = self.model_dump(mode="json", exclude={"kind", "encoder", "arguments"})
         return {key: value for key, value in values.items() if value}

@@ -161,7 +161,7 @@ class DistillConfig(Run):
             told where a step ends.
         selection: the selection of these times.
         init: checkpoint of a student of this teacher, or name of a shipped model, to train
-            further; it determines the times. By default the teacher is the start.
+            further; it determines networks and times. By default the teacher is the start.
     """
 
     teacher: Path
