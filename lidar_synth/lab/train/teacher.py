@@ -29,7 +29,9 @@ class TeacherStage(Stage):
         # The maps of such scans have the gaps of their projection, which the model learns.
         if config.data.path and "semantic" in header.conditioning:
             options = header.conditioning["semantic"] | {"keep_gaps": True}
-            header = replace(header, conditioning={"semantic": options})
+            header = replace(
+                header, conditioning=header.conditioning | {"semantic": options}
+            )
         if config.codec is not None and CODEC not in networks:
             networks[CODEC] = load_checkpoint(config.codec).networks[CODEC]
         frozen = {name: part for name, part in networks.items() if name == CODEC}
