@@ -21,6 +21,7 @@ from bakes import SIZE, files, plan_in
 from test_generator import write
 
 import lidar_synth.bake.folder as folder_module
+import lidar_synth.bake.processes as processes_module
 import lidar_synth.bake.run as run_module
 import lidar_synth.bake.shard as shard_module
 from lidar_synth.bake import ENGINES, BakePlan, Resources, Share, bake, bake_shard
@@ -28,6 +29,7 @@ from lidar_synth.bake.folder import prepare
 from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bank import INDEX, Index
 from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.files.processes import GUARD
 from lidar_synth.formats.writer import NOTES
 
 
@@ -161,7 +163,7 @@ def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
         "processes",
         "--workers",
         "2",
-        process_group=0,
+        start_new_session=True,
     )
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     # the workers, and Python's own for what they share
@@ -192,6 +194,22 @@ def test_a_killed_worker_is_reported(
     ):
         ENGINES["processes"](plan, range(3), Resources(1), kill)
     assert multiprocessing.active_children() == []
+
+
+def leave(*args: Any) -> None:
+    """A worker that ends as one does that runs a script without a guard again."""
+    sys.exit(1)
+
+
+@pytest.mark.slow
+def test_a_worker_that_fails_was_not_killed(
+    plan: BakePlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare(plan)
+    monkeypatch.setattr(processes_module, "_work", leave)
+    with pytest.raises(FileError, match=r"a worker failed \(exit status 1\)") as error:
+        ENGINES["processes"](plan, range(4), Resources(1), lambda scans: None)
+    assert GUARD in str(error.value) and "memory" not in str(error.value)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import importlib
 import json
 import re
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -60,16 +61,29 @@ def test_this_machine_works() -> None:
     assert re.search(r"\d+ cores", named(findings, "CPU").found)
 
 
-def test_every_dependency_is_looked_at() -> None:
-    """The list is the installed package's own."""
+def test_every_dependency_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once, by its name and the least version, and as installed if it is."""
     project = PYPROJECT["project"]
-    names = {
-        re.split(r"[>=<; ]", line)[0]
-        for line in project["dependencies"] + project["optional-dependencies"]["open3d"]
-    }
-    assert names <= {finding.name for finding in examine()}
-    assert set(doctor.OPTIONAL) <= names
-    assert set(doctor.MODULES) <= names
+    lines = list(project["dependencies"])
+    for extra, needed in project["optional-dependencies"].items():
+        if extra not in doctor.DEVELOPMENT:
+            lines += [f"{line}; extra == '{extra}'" for line in needed]
+    names = [re.split(r"[\[!>=<; ]", line)[0] for line in lines]
+    monkeypatch.setattr(doctor, "requires", lambda package: lines)
+    findings = list(doctor._libraries())[1:-1]  # Python before, the projection after
+    assert [finding.name for finding in findings] == names
+    for finding in findings:
+        if finding.found == "not installed":
+            with pytest.raises(PackageNotFoundError):
+                version(finding.name)
+    assert set(doctor.OPTIONAL) | set(doctor.MODULES) <= set(names)
+
+
+@pytest.mark.parametrize("line", ["h5py>=99.1", "h5py[a,b] >=99.1", "h5py!=3.2,>=99.1"])
+def test_a_least_version_is_found(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "requires", lambda package: [line])
+    found = named(list(doctor._libraries()), "h5py")
+    assert found.found.endswith(", older than 99.1")
 
 
 def test_a_required_library_that_is_missing_breaks_the_package(

@@ -237,10 +237,14 @@ BAD: dict[str, tuple[Callable[[], list[Scan]], str]] = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_has_no_beams_is_refused(name: str) -> None:
+def test_what_has_no_beams_is_refused(
+    name: str, caplog: pytest.LogCaptureFixture
+) -> None:
     make, message = BAD[name]
     with pytest.raises(DataError, match=message):
         fit_sensor(make())
+    if name == "points anywhere":
+        assert "which takes minutes" in caplog.text
 
 
 def test_every_point_gets_its_ring_and_firing() -> None:

@@ -1,5 +1,5 @@
 """Ctrl-C on the command line: one message, the exit status of an interrupted program, and no word
-from workers."""
+from workers; and workers that end before their work."""
 
 import os
 import signal
@@ -15,7 +15,7 @@ import typer
 from layouts import some_scan, write_all
 
 from lidar_synth import cli
-from lidar_synth.files.processes import defer_signals
+from lidar_synth.files.processes import GUARD, defer_signals
 
 
 def test_control_c_gives_one_message(
@@ -81,6 +81,26 @@ def test_control_c_waits_while_processes_start() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.parametrize(
+    ("guard", "work"), [("True", "abs"), ("__name__ == '__main__'", "os._exit")]
+)
+def test_a_worker_that_ends_is_explained(tmp_path: Path, guard: str, work: str) -> None:
+    """One that runs a script without a guard again, or one that ends at its work."""
+    script = tmp_path / "script.py"
+    lines = [
+        "import os",
+        "from lidar_synth.files.processes import map_in_processes",
+        f"if {guard}:",
+        f"    with map_in_processes({work}, [1, 2], 2) as done:",
+        "        print(list(done))",
+    ]
+    script.write_text("\n".join(lines))
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert ended.returncode == 1
+    assert "ProcessError: a worker ended before its work" in ended.stderr
+    assert ended.stderr.rstrip().endswith(GUARD)
+
+
 def children(process: int) -> list[str]:
     return Path(f"/proc/{process}/task/{process}/children").read_text().split()
 
@@ -118,7 +138,7 @@ def test_control_c_with_workers(tmp_path: Path, command: str, when: str) -> None
         [sys.executable, "-m", "lidar_synth", *call],
         stderr=subprocess.PIPE,
         text=True,
-        process_group=0,
+        start_new_session=True,
     )
     while not WHEN[when](process.pid, out):
         assert process.poll() is None, process.communicate()

@@ -23,6 +23,14 @@ def test_the_first_code_has_six_lines() -> None:
     assert len([line for line in code.splitlines() if line.strip()]) <= 6
 
 
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_a_loader_with_workers_stands_below_a_guard(document: Path) -> None:
+    """Else it fails as a script on macOS, where workers are spawned."""
+    for code in re.findall(r"```python.*?\n(.*?)```", document.read_text(), re.S):
+        if re.search(r"\.loader\([^)]*num_workers=[1-9]", code):
+            assert 'if __name__ == "__main__":' in code
+
+
 def anchors(text: str) -> set[str]:
     """The anchors that GitHub makes of the headings of a Markdown file."""
     headings = re.findall(

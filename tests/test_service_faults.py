@@ -17,6 +17,7 @@ from test_generator import write
 from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ProcessError
+from lidar_synth.files.processes import GUARD
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, save_checkpoint
 from lidar_synth.mixing.service import RollingBank
 
@@ -210,10 +211,7 @@ def test_a_script_without_a_main_guard_gets_a_hint(path: Path, tmp_path: Path) -
         timeout=60,
     )
     assert trainer.returncode == 1
-    assert (
-        "A script that starts processes begins with: if __name__ == '__main__':"
-        in trainer.stderr
-    )
+    assert GUARD in trainer.stderr
 
 
 @pytest.mark.slow

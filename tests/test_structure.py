@@ -9,6 +9,8 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import pytest
+from mypy import api
+from project import PYPROJECT
 from sizes import size_of
 
 import lidar_synth
@@ -103,6 +105,28 @@ def test_the_package_never_imports_its_integrations() -> None:
         for p in PACKAGE.rglob("*.py")
         if INTEGRATIONS not in p.parents
     )
+
+
+def test_the_oldest_python_has_what_is_imported_of_its_library(tmp_path: Path) -> None:
+    """Else only a test on that version would notice."""
+    imports = {
+        ast.unparse(node)
+        for path in [*PACKAGE.rglob("*.py"), *INTEGRATIONS.rglob("*.py")]
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        and (getattr(node, "module", None) or node.names[0].name).split(".")[0]
+        in sys.stdlib_module_names
+    }
+    path = tmp_path / "imports.py"
+    path.write_text("\n".join(sorted(imports)))
+    oldest = PYPROJECT["project"]["requires-python"].removeprefix(">=")
+    # Several modules may have one name.
+    options = ["--config-file=", "--disable-error-code=assignment"]
+    cache = f"--cache-dir={tmp_path}"
+    found, _, status = api.run(
+        [*options, cache, f"--python-version={oldest}", str(path)]
+    )
+    assert status == 0, found
 
 
 ROOMS = 15

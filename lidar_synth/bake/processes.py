@@ -14,7 +14,7 @@ from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import FileError
-from lidar_synth.files.processes import defer_signals
+from lidar_synth.files.processes import GUARD, defer_signals
 
 _POLL = 0.2  # seconds between two checks of the workers
 _PATIENCE = 60  # seconds for a worker to abort its shard
@@ -26,7 +26,7 @@ def bake_in_processes(
     """Write the shards in ``resources.workers`` processes.
 
     Raises:
-        FileError: if a worker was killed.
+        FileError: if a worker was killed, or failed without an error to pass on.
     """
     context = get_context("spawn")  # a fork would share torch's threads
     count = min(resources.workers, len(numbers))
@@ -58,15 +58,8 @@ def bake_in_processes(
             reported = made
             if not errors.empty():
                 raise errors.get()
-            if killed := [
-                worker for worker in workers if worker.exitcode not in (None, 0)
-            ]:
-                raise FileError(
-                    f"a worker was killed (exit status {killed[0].exitcode})",
-                    "enough memory for all workers",
-                    "Run the same command again, possibly with fewer workers: finished shards "
-                    "are kept.",
-                )
+            if codes := [worker.exitcode for worker in workers if worker.exitcode]:
+                raise _ended(codes[0])
         if not errors.empty():
             raise errors.get()
         progress(sum(scans) - reported)
@@ -77,6 +70,20 @@ def bake_in_processes(
             worker.join(_PATIENCE)
             worker.kill()  # it may wait for a lock that a killed worker held
             worker.join()
+
+
+def _ended(code: int) -> FileError:
+    """The error of a worker's exit status; a negative one is that of a signal."""
+    if code > 0:
+        return FileError(
+            f"a worker failed (exit status {code}), as its output says", hint=GUARD
+        )
+    return FileError(
+        f"a worker was killed (exit status {code})",
+        "enough memory for all workers",
+        "Run the same command again, possibly with fewer workers: finished shards are "
+        "kept.",
+    )
 
 
 def _work(

@@ -52,7 +52,12 @@ OPTIONAL = {
 }
 """Purposes of the optional dependencies; every other dependency is required."""
 
-MODULES = {"pyyaml": "yaml", "pillow": "PIL"}
+MODULES = {
+    "pyyaml": "yaml",
+    "pillow": "PIL",
+    "mcap-ros2-support": "mcap_ros2",
+    "rerun-sdk": "rerun",
+}
 """Import names of the distributions whose import name differs."""
 
 SHARED_OBJECTS = {
@@ -160,7 +165,7 @@ def _libraries() -> Iterator[Finding]:
     for line in wanted:
         requirement, _, marker = line.partition(";")
         extra = re.search(r"extra == ['\"]([\w-]+)['\"]", marker)
-        parts = re.match(r"([\w.-]+?)\s*(?:>=\s*([\d.]+))?\s*$", requirement.strip())
+        parts = re.match(r"([\w.-]+)[^>]*(?:>=\s*([\d.]+))?", requirement)
         if parts and not (extra and extra[1] in DEVELOPMENT):
             yield _library(parts[1], parts[2] or "0", extra[1] if extra else None)
     yield _geometry()

@@ -6,12 +6,18 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context, resource_tracker
 from typing import Any, TypeVar
 
+from lidar_synth.errors import ProcessError
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+GUARD = "In a script, put what starts processes below: if __name__ == '__main__':"
+"""What to type where a process ended before its work: it runs a script again from the top."""
 
 _work: Callable[[Any], Any] | None = None
 _busy = _stopped = False
@@ -99,6 +105,9 @@ def map_in_processes(
         items: its arguments.
         jobs: number of processes; 1 = this process.
         chunk: number of items that a worker takes at a time.
+
+    Raises:
+        ProcessError: if a worker ended before its work.
     """
     if jobs == 1 or len(items) < 2:
         yield map(work, items)
@@ -111,6 +120,10 @@ def map_in_processes(
             with defer_signals(signal.SIGINT):  # map starts the workers
                 results = pool.map(_next, items, chunksize=chunk)
             yield results
+        except BrokenProcessPool as error:
+            raise ProcessError(
+                "a worker ended before its work", "enough memory for all workers", GUARD
+            ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

@@ -514,7 +514,8 @@ class MixedScans(Dataset[Any]):
 
         Args:
             batch_size: number of samples in a batch, on each rank.
-            num_workers: number of worker processes.
+            num_workers: number of worker processes; where they are spawned (macOS, Windows,
+                Python 3.14), a script does this below ``if __name__ == "__main__":``.
             options: further arguments of ``DataLoader``.
 
         Example:

@@ -1,6 +1,7 @@
 """From points to beams: rings from the file, from the order of the points, or from peaks of the
 elevations."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,8 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.peaks import beam_peaks
 from lidar_synth.lab.fitting.search import REACH, find_motion, find_mount
+
+log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
@@ -216,6 +219,10 @@ def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud
     )
     best, quality = _attempt(part, still, seed)
     if quality < GOOD:
+        log.warning(
+            "the points show no sharp beams from their origin: the sensor's place is "
+            "searched, which takes minutes"
+        )
         offset, turn = find_mount(
             [cloud.points[cloud.scan == scan] for scan in range(len(scans))], seed
         )

@@ -183,7 +183,8 @@ def prove(
         settings: of the comparison.
         minutes: limit of the time; places and seeds are chosen so that it is kept, and if not even
             two fit, the iterations of a training.
-        jobs: processes of one thread each; by default one for each core.
+        jobs: processes of one thread each; by default one for each core. With more than one, a
+            script calls this below ``if __name__ == "__main__":``.
         trainer: your own in the place of the small network: a function that can be pickled, or a
             ``CommandTrainer``.
         pools: folder of the synthetic scans, which several comparisons may share; by default in

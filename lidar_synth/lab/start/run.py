@@ -218,7 +218,8 @@ def start(
         scans: number of synthetic scans.
         minutes: limit of the comparison with real scans only; 0 leaves it out.
         trainer: one of ``lab.start.trainers.TRAINERS``, to write its configuration too.
-        jobs: processes; by default one for each core.
+        jobs: processes; by default one for each core. With more than one, a script
+            calls this below ``if __name__ == "__main__":``.
         dry_run: only say what would be made, in how many minutes and megabytes.
         say: called with each line that tells what is done.
         reading: further options of ``open_scans``.

@@ -7,10 +7,11 @@ Synthesis", CVPR 2021).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import Self
 
 from lidar_synth.generate.checkpoint import CODEC, Header
 from lidar_synth.generate.codec import Latent

@@ -15,6 +15,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from lidar_synth.errors import ConfigError, ProcessError
+from lidar_synth.files.processes import GUARD
 from lidar_synth.mixing.service.process import GET, GeneratorJob, receive, run, send
 from lidar_synth.mixing.service.slots import Slots
 
@@ -65,10 +66,7 @@ class Client:
                 raise self._late("loaded the model")
             return started.recv_bytes().decode()
         except EOFError as error:
-            guard = (
-                "A script that starts processes begins with: if __name__ == '__main__':"
-            )
-            raise self._died("" if self._slots.last_words else guard) from error
+            raise self._died("" if self._slots.last_words else GUARD) from error
         except BaseException:
             self.close()
             raise
