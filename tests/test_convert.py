@@ -308,6 +308,19 @@ def test_the_command(drive: Path, tmp_path: Path) -> None:
     assert "0 scans written, 3 were there already, 0 skipped" in result.output
 
 
+def test_the_command_leaves_unreadable_scans_out_of_what_it_reads_beside_each(
+    drive: Path, tmp_path: Path
+) -> None:
+    sorted(drive.rglob("*.bin"))[-1].write_bytes(b"cut")
+    options = ["--to", "range", "--as-sensor", "os1_128", "--sweeps", "1"]
+    options += ["--like", str(tmp_path / "like"), "--on-bad", "skip"]
+    write_all("npz", tmp_path / "like", [record(load_sensor("os1_128"))])
+    with pytest.warns(UserWarning, match="skipped scan"):
+        result = CliRunner().invoke(app, [str(drive), str(tmp_path / "out"), *options])
+    assert result.exit_code == 0, result.output
+    assert "2 scans written, 0 were there already, 1 skipped" in result.output
+
+
 WRONG = {
     "--mount without a sensor": (["--mount", "0,0"], "mount without --as-sensor"),
     "a mount of one number": (

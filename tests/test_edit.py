@@ -116,6 +116,16 @@ def test_the_rays_of_a_scan_lead_to_its_points() -> None:
         )
 
 
+def test_a_range_image_has_one_ray_per_column() -> None:
+    """With the rings of its returns too, where its sensor fires more often."""
+    image = project(Town(seed=3, scans=1)[0])
+    scan = unproject(image)
+    assert scan.ring is not None
+    for ring in (scan.ring, None):
+        count = len(rays_of_scan(replace(scan, ring=ring)).point)
+        assert abs(count / image.range.size - 1) < 0.02
+
+
 def test_rays_of_a_grid_start_where_its_rows_do() -> None:
     sensor = load_sensor("hdl64e_lasers")
     scan = unproject(project(Town(seed=0, scans=1, sensor=sensor, motion=False)[0]))

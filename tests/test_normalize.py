@@ -169,6 +169,11 @@ def test_impossible_numbers_are_refused(key: str, value: Any) -> None:
         )
 
 
+def test_inverse_ranges_start_above_0() -> None:
+    with pytest.raises(ConfigError, match="0 < range_min"):
+        Normalisation("inverse", 0.0, 80.0)
+
+
 @pytest.mark.parametrize("name", [["hdit"], {}, None, "x"])
 def test_an_architecture_that_is_no_name_is_refused(name: Any) -> None:
     with pytest.raises(ConfigError, match="architecture"):

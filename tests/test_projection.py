@@ -46,6 +46,15 @@ def image_of(sensor: Sensor, seed: int, share: float = 0.7) -> RangeImage:
     return RangeImage(distance.astype(np.float32), sensor, {"label": label})
 
 
+def test_returns_at_the_range_limits_are_projected_again(sensor: Sensor) -> None:
+    limits = np.float32([sensor.range_min or 1, sensor.range_max])
+    image = RangeImage(np.resize(limits, sensor.shape), sensor)
+    points = unproject(image).points
+    assert project(Scan(points, np.zeros(len(points), np.float32), sensor)).mask.all()
+    offsets = torch.tensor([0, len(points)])
+    assert (project_batch(torch.from_numpy(points), offsets, sensor).range > 0).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("beams", [False, True])
 def test_unprojecting_and_projecting_keeps_every_cell(
@@ -144,10 +153,11 @@ def test_points_outside_the_range_limits_hide_no_other_point() -> None:
 
 @pytest.mark.parametrize("kind", sorted(SMALL))
 def test_returns_at_exactly_the_range_limits_are_kept(kind: str) -> None:
-    """Both limits are inclusive in every projection; the next float32 beyond a limit is dropped."""
+    """Both limits are inclusive in every projection; what lies beyond rounding errors is
+    dropped."""
     low = np.float32(2.5)
     high = np.float32(40)
-    outside = np.nextafter(low, np.float32(0)), np.nextafter(high, np.float32(50))
+    outside = low * np.float32(1 - 2e-6), high * np.float32(1 + 2e-6)
     sensor = replace(SMALL[kind], range_min=float(low), range_max=float(high))
     points = np.zeros((4, 3), np.float32)
     for i, distance in enumerate((low, high, *outside)):
@@ -223,6 +233,11 @@ def test_batches_on_any_device_equal_single_projections(
     sensor: Sensor, device: str, beams: bool
 ) -> None:
     sensor = sensor.by_beams() if beams else sensor
+    empty = project_batch(
+        torch.zeros(0, 4, device=device), torch.tensor([0, 0]), sensor
+    )
+    assert empty.range.shape == (1, *sensor.shape) and not empty.range.any()
+    assert empty.channels.shape == (1, 1, *sensor.shape) and (empty.point < 0).all()
     scans = [random_scan(sensor, n, seed) for seed, n in enumerate((5000, 1, 3000))]
     points = np.concatenate(
         [np.c_[s.points, s.reflectance, s.label] for s in scans]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry.sensor import Sensor, load_sensor, sensor_yaml
 from lidar_synth.lab.town import (
     STRETCH_FRAMES,
     Skin,
@@ -241,6 +241,8 @@ def test_what_no_skin_can_be_learnt_from(plain: list[Scan]) -> None:
         fit_skin(plain, load_sensor("hdl64e_kitti"), progress=False)
     with pytest.raises(DataError, match="rings 0 to 31"):
         fit_skin(plain, replace(SENSOR, rows=16), progress=False)
+    with pytest.raises(DataError, match="range image, with 900 columns for the 1800"):
+        fit_skin(plain, replace(SENSOR, firings=1800), progress=False)
 
 
 WRONG: dict[str, tuple[Callable[[Skin], object], type[LidarSynthError], str]] = {
@@ -292,6 +294,23 @@ def test_the_shipped_skin_states_where_it_comes_from() -> None:
 def test_the_command_line_describes_a_skin() -> None:
     result = CliRunner().invoke(app, ["skin", "show", "pandar64"])
     assert result.exit_code == 0 and "CC BY 4.0" in result.output
+
+
+def test_the_command_line_reads_scans_as_other_commands_do(
+    plain: list[Scan], tmp_path: Path
+) -> None:
+    (tmp_path / "sensor.yaml").write_text(sensor_yaml(SENSOR), encoding="utf-8")
+    (tmp_path / "logs").mkdir()
+    for number, scan in enumerate(plain):
+        order = np.lexsort((np.arctan2(*scan.points.T[1::-1]) % (2 * np.pi), scan.ring))
+        levels = np.round(scan.reflectance * 255)
+        file = tmp_path / "logs" / f"{number:06}.bin"
+        np.c_[scan.points, levels][order].astype("<f4").tofile(file)
+    out = tmp_path / "my.skin"
+    given = ["--licence", "none", "--streets", "1", "--reflectance-max", "255"]
+    given += ["--sensor", str(tmp_path / "sensor.yaml"), "--out", str(out)]
+    result = CliRunner().invoke(app, ["skin", "fit", str(tmp_path / "logs"), *given])
+    assert result.exit_code == 0 and load_skin(out).step == 1 / 255, result.output
 
 
 def test_quantiles_by_group_are_those_of_numpy() -> None:

@@ -25,7 +25,7 @@ from lidar_synth.viz import (
     make_scales,
     picture,
 )
-from lidar_synth.viz.page import SCRIPTS
+from lidar_synth.viz.page import SCRIPTS, pack
 from lidar_synth.viz.render import box_segments
 from lidar_synth.viz.scales import VALUES
 
@@ -90,6 +90,12 @@ def test_the_page_contains_all_points(page: str, scans: list[Scan]) -> None:
             np.testing.assert_allclose(
                 confidence[0], scan.confidence, atol=0.5 / 255 + 1e-6
             )
+
+
+def test_labels_of_any_integers_are_packed_as_bytes(scans: list[Scan]) -> None:
+    """Predictions of a network are int64."""
+    scan = next(s for s in scans if s.label is not None)
+    assert pack(replace(scan, label=scan.label.astype(np.int64))) == pack(scan)
 
 
 def test_the_page_contains_the_facts_of_each_scan(page: str, scans: list[Scan]) -> None:

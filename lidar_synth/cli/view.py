@@ -65,7 +65,7 @@ def view(
 
 
 def _read(source: "ScanFiles", index: int, count: int) -> "list[Scan]":
-    """Read scans ``index``, ``index`` + 1, ... of a source.
+    """Read scans ``index``, ``index`` + 1, ... of a source, without those that are skipped.
 
     Raises:
         ConfigError: if the index is out of range.
@@ -79,6 +79,6 @@ def _read(source: "ScanFiles", index: int, count: int) -> "list[Scan]":
             f"0 .. {len(source) - 1}",
         )
     chosen = range(first, min(first + count, len(source)))
-    return [
-        source[i] for i in tqdm(chosen, "reading", unit="scan", disable=len(chosen) < 8)
-    ]
+    read = map(source.load_or_skip, chosen)
+    bar = tqdm(read, "reading", len(chosen), unit="scan", disable=len(chosen) < 8)
+    return [scan for scan in bar if scan is not None]

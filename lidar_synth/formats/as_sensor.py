@@ -1,7 +1,7 @@
 """The scans of a source as another sensor would have recorded them, with what files need beside the
 scan."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -47,12 +47,10 @@ class AsSensor:
         """The scan at ``index`` of a source, which has been read; its noise depends on the index.
 
         Raises:
-            DataError, FileError: as ``Transfer.cast``; also if a neighbouring sweep cannot be read.
+            DataError, FileError: as ``Transfer.cast``; also if a neighbouring sweep cannot be read,
+                unless the source skips it.
         """
-        others = [
-            source.load(i) if isinstance(source, ScanFiles) else source[i]
-            for i in self._around(source, index)
-        ]
+        others = _read(source, self._around(source, index))
         return self.transfer.cast(scan, keyed_rng(0, index), others)
 
     def _around(self, source: Source, index: int) -> list[int]:
@@ -83,6 +81,13 @@ class AsSensor:
     def identity(self) -> str:
         """A text of everything that determines the scans."""
         return f"{self.transfer.identity} {self.sweeps} sweeps"
+
+
+def _read(source: Any, numbers: Iterable[int]) -> list[Scan]:
+    """The scans of a source by number, without those that it skips."""
+    if not isinstance(source, ScanFiles):
+        return [source[i] for i in numbers]
+    return [scan for i in numbers if (scan := source.load_or_skip(i)) is not None]
 
 
 def _sequence(source: Source, index: int) -> str:
@@ -174,6 +179,4 @@ def _some(scans: Any) -> list[Scan]:
     if hasattr(scans, "range_images"):
         return list(scans.scans(0, list(range(4))))
     numbers = sorted({round(k * (len(scans) - 1) / 9) for k in range(10)})
-    return [
-        scans.load(i) if isinstance(scans, ScanFiles) else scans[i] for i in numbers
-    ]
+    return _read(scans, numbers)

@@ -198,7 +198,7 @@ class ScanFiles(ABC):
         if self.on_bad != "skip":
             return self.load(index % len(self))
         for step in range(len(self)):
-            scan = self._try((index + step) % len(self))
+            scan = self.load_or_skip((index + step) % len(self))
             if scan is not None:
                 return scan
         reason = next(iter(self.skipped.values()))
@@ -209,11 +209,15 @@ class ScanFiles(ABC):
 
     def __iter__(self) -> Iterator[Scan]:
         for index in range(len(self)):
-            scan = self.load(index) if self.on_bad != "skip" else self._try(index)
+            scan = self.load_or_skip(index)
             if scan is not None:
                 yield scan
 
-    def _try(self, index: int) -> Scan | None:
+    def load_or_skip(self, index: int) -> Scan | None:
+        """``load`` a scan; None, with a warning, if it cannot be read and ``on_bad`` is
+        ``"skip"``."""
+        if self.on_bad != "skip":
+            return self.load(index)
         name = self.ids[index]
         if name in self.skipped:
             return None

@@ -37,7 +37,8 @@ class Normalisation:
         offset: added before the logarithm.
 
     Raises:
-        ConfigError: on an unknown kind or limits that are not 0 <= range_min < range_max.
+        ConfigError: on an unknown kind or limits that are not 0 <= range_min < range_max, for
+            "inverse" 0 < range_min.
 
     Example:
         >>> import torch
@@ -74,10 +75,12 @@ class Normalisation:
                 f"normalisation {numbers}",
                 "finite numbers, with a scale and an offset above 0",
             )
-        if not 0 <= self.range_min < self.range_max:
+        if not 0 <= self.range_min < self.range_max or (
+            self.kind == "inverse" and self.range_min == 0
+        ):
             raise ConfigError(
-                f"range limits {self.range_min}, {self.range_max} m",
-                "0 <= range_min < range_max",
+                f"{self.kind!r} with range limits {self.range_min}, {self.range_max} m",
+                "0 <= range_min < range_max, for 'inverse' 0 < range_min",
             )
 
     @property

@@ -48,7 +48,9 @@ def pack(scan: Scan) -> tuple[bytes, float]:
     columns = [np.diff(places[:, axis], prepend=np.int16(0)) for axis in range(3)]
     columns += [
         _byte(scan.reflectance),
-        np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label,
+        np.full(len(scan), IGNORE, np.uint8)
+        if scan.label is None
+        else scan.label.astype(np.uint8),
     ]
     columns += [] if scan.confidence is None else [_byte(scan.confidence)]
     return zlib.compress(b"".join(column.tobytes() for column in columns), 9), metres

@@ -125,13 +125,11 @@ def project_batch(
     best.scatter_reduce_(
         0, (cloud * (height * width) + cell)[in_range], key[in_range], "amin"
     )
-    hit = best < _NONE
-    point = torch.where(hit, best & 0xFFFFFFFF, -1).view(batch, height, width)
-    shown = torch.where(
-        hit.view_as(point)[..., None], points[point.clamp(min=0)][..., 3:], 0.0
-    )
-    distances = torch.where(hit.view_as(point), distance[point.clamp(min=0)], 0.0)
-    return BatchImage(distances, shown.movedim(-1, 1), point)
+    point = torch.where(best < _NONE, best & 0xFFFFFFFF, -1).view(batch, height, width)
+    # -1 is the last row, of zeros.
+    shown = torch.cat([points, points.new_zeros(1, points.shape[1])])[point]
+    distances = torch.cat([distance, distance.new_zeros(1)])[point]
+    return BatchImage(distances, shown[..., 3:].movedim(-1, 1), point)
 
 
 def torch_atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:

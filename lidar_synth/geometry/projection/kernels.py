@@ -21,6 +21,10 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
 
+MARGIN = 1e-6
+"""Part of the range limits by which a point may lie beyond them: the rounding error of float32
+points, so that a return at a limit is kept when it is projected again."""
+
 _f = np.float32
 ATAN = tuple(
     map(_f, (8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1))
@@ -61,7 +65,7 @@ class Grid(NamedTuple):
         lifts: (H+1,) metres above the origin at which the edges start; as ``slopes``.
         starts: (H,) metres above the origin at which the lasers start; as ``slopes``.
         rows, columns: H, W.
-        range_min, range_max: metres, inclusive.
+        range_min, range_max: metres, inclusive; ``MARGIN`` beyond the sensor's limits.
     """
 
     up: np.float32
@@ -89,8 +93,9 @@ def grid_of(sensor: Sensor) -> Grid:
         slopes = np.tan(edges)
         between = (starts[1:] + starts[:-1]) / 2
         lifts = np.concatenate([starts[:1], between, starts[-1:]])
-    limits = _f(sensor.range_min), _f(sensor.range_max)
-    return Grid(up, down, edges, slopes, lifts, starts, *sensor.shape, *limits)
+    near = _f(sensor.range_min * (1 - MARGIN))
+    far = _f(sensor.range_max * (1 + MARGIN))
+    return Grid(up, down, edges, slopes, lifts, starts, *sensor.shape, near, far)
 
 
 @numba.njit(inline="always")

@@ -21,7 +21,12 @@ from lidar_synth.geometry.transfer.returns import (
     gather_hits,
     place_returns,
 )
-from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, estimate
+from lidar_synth.geometry.transfer.surfaces import (
+    ScanSurfaces,
+    as_fired,
+    estimate,
+    rings_of,
+)
 from lidar_synth.geometry.transfer.sweeps import moved
 from lidar_synth.noise import keyed_rng
 
@@ -60,8 +65,9 @@ class Transfer:
     interpolated; the ring is the target's laser. Boxes, pose and the rest move to the target's
     frame; boxes in which the target has no return are left out.
 
-    A scan of a sensor with the target's lasers, in the same place, keeps its returns: rays cast at
-    its own surfaces add nothing (docs/research/transfer.md).
+    A scan of a sensor with the target's lasers, which fired about as often from the same place,
+    keeps its returns: rays cast at its own surfaces add nothing (docs/research/transfer.md). In a
+    range image, a sensor has fired once per column.
 
     Args:
         target: the sensor to imitate: its lasers, firings, limits and quantisation.
@@ -127,14 +133,12 @@ class Transfer:
         """The scan's returns within the limits of the target, if its sensor has fired the same
         lasers about as often from the same place and measures alike; None if not, or if no return
         is left or a point is not finite."""
-        fired = sorted(s.firings or s.columns for s in (scan.sensor, self.target))
         measured = replace(self.measurement, response=None)
         if (
             self.recast
             or self.mount != Mount()
             or measured != Measurement()
             or self.target.range_step not in (None, scan.sensor.range_step)
-            or fired[0] < 0.9 * fired[1]
             or not self.target.same_lasers(scan.sensor)
         ):
             return None
@@ -142,6 +146,10 @@ class Transfer:
         limits = self.target.range_min, self.target.range_max
         inside = np.clip(distance, *limits) == distance
         if not inside.any() or not np.isfinite(distance).all():
+            return None
+        fired_by = as_fired(scan, rings_of(scan)[0])
+        fired = sorted(s.firings or s.columns for s in (fired_by, self.target))
+        if fired[0] < 0.9 * fired[1]:
             return None
         kept = scan[inside]
         return replace(

@@ -1,9 +1,11 @@
 """``lidar-synth skin``: learn the look of a sensor's returns from real scans, and describe it."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from lidar_synth.cli.options import Reading, drop_missing, options_from
 
 skin = typer.Typer(
     name="skin",
@@ -13,6 +15,7 @@ skin = typer.Typer(
 
 
 @skin.command("fit")
+@options_from(Reading, after="sensor")
 def fit_from_scans(
     scans: Annotated[
         Path,
@@ -41,12 +44,14 @@ def fit_from_scans(
     seed: Annotated[
         int, typer.Option(min=0, help="seed of the town that they are compared with")
     ] = 0,
+    **reading: Any,
 ) -> None:
     """Learns a skin from 20 to 100 real scans, in some minutes; labels are not used.
 
     \b
-    Example:
+    Examples:
       lidar-synth skin fit my_scans --out my.skin --licence "CC BY 4.0"
+      lidar-synth skin fit logs --out my.skin --licence none --reflectance-max 255
     """
     from lidar_synth.errors import ConfigError
     from lidar_synth.formats import open_scans
@@ -54,7 +59,7 @@ def fit_from_scans(
 
     if out.suffix != ".skin":
         raise ConfigError(f"--out {out}", "a name that ends in .skin")
-    source = open_scans(scans, sensor=sensor)
+    source = open_scans(scans, sensor=sensor, **drop_missing(reading))
     count = min(most, len(source))
     picked = [source[i * len(source) // count] for i in range(count)]
     learnt = fit_skin(

@@ -19,7 +19,12 @@ from lidar_synth.geometry.overlap import find_overlapping
 from lidar_synth.geometry.scan import Boxes, Scan, wrap_angle
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.rays import rays_from
-from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, estimate, rings_of
+from lidar_synth.geometry.transfer.surfaces import (
+    ScanSurfaces,
+    as_fired,
+    estimate,
+    rings_of,
+)
 from lidar_synth.labels.boxes import grow_box, join_boxes, turn_points
 from lidar_synth.labels.edit.compose import next_instance, replace_returns
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
@@ -240,11 +245,8 @@ def cut_out(scan: Scan, box: int) -> Object:
         DataError: if there is no such box, or no return in it.
     """
     select_boxes(scan, box)
-    if scan.ring is None:
-        ring, on_grid = rings_of(scan)
-        # As many as columns.
-        sensor = replace(scan.sensor, firings=None) if on_grid else scan.sensor
-        scan = replace(scan, ring=ring.astype(np.int16), sensor=sensor)
+    ring = rings_of(scan)[0]
+    scan = replace(scan, ring=ring.astype(np.int16), sensor=as_fired(scan, ring))
     found = objects_of(scan, least=1)
     if box not in found:
         raise DataError(
@@ -403,16 +405,14 @@ def _hits(
 
 def _surfaces(part: Scan) -> ScanSurfaces:
     """The surfaces of an object's returns."""
-    ring, on_grid = rings_of(part)
-    sensor = replace(part.sensor, firings=None) if on_grid else part.sensor
     return estimate(
         Scan(
             part.points,
             part.reflectance,
-            sensor,
+            part.sensor,
             label=part.label,
             raw_label=part.raw_label,
-            ring=ring.astype(np.int16),
+            ring=rings_of(part)[0].astype(np.int16),
             id=part.id,
         )
     )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer.kernels import WIDEST
-from lidar_synth.geometry.transfer.surfaces import rings_of
+from lidar_synth.geometry.transfer.surfaces import as_fired, rings_of
 
 
 class ScanRays(NamedTuple):
@@ -89,13 +89,15 @@ class ScanRays(NamedTuple):
 
 def rays_of_scan(scan: Scan) -> ScanRays:
     """The rays of a scan of N returns; gaps between the returns of a ring are rays without a
-    return.
+    return. A range image has one ray per column.
 
     The rings are ``scan.ring``, or follow from the order of the points, or are the rows of the
     sensor's grid. In the last case rays start at the origin, unless those of the grid start above
     it (``Sensor.starts``).
     """
     ring, on_grid = rings_of(scan)
+    sensor = as_fired(scan, ring)
+    step = 2 * np.pi / (sensor.firings or sensor.columns)
     starts = (
         scan.sensor.starts.astype(np.float64)
         if len(scan.sensor.starts)
@@ -117,15 +119,6 @@ def rays_of_scan(scan: Scan) -> ScanRays:
     following = np.arange(1, len(ring) + 1)
     following[last] = first
     gap = azimuth[following] - azimuth + 2 * np.pi * last
-    step = (
-        2
-        * np.pi
-        / (
-            scan.sensor.columns
-            if on_grid
-            else scan.sensor.firings or scan.sensor.columns
-        )
-    )
     added = np.where(gap > WIDEST * step, np.rint(gap / step).astype(np.int64) - 1, 0)
     source = np.repeat(np.arange(len(ring)), added + 1)
     ends = np.cumsum(added + 1)

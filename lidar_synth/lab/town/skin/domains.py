@@ -1,6 +1,6 @@
 """The returns of several scans with their features and strata: a domain, real or the town's."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import laser_rows
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.transfer.surfaces import as_fired
 from lidar_synth.lab.town.catalogue import Rng
 from lidar_synth.lab.town.skin.features import (
     BANDS,
@@ -79,7 +80,8 @@ def returns_of(
         centred: whether reflectance was rounded to the nearest step rather than down.
 
     Raises:
-        DataError: on a scan that is not in ring order, or of another sensor.
+        DataError: on a scan that is not in ring order, of another sensor, or a range image with
+            fewer columns than the sensor fires.
     """
     rows = laser_rows(scan, lasers.by_beams())
     if scan.ring is not None:
@@ -89,6 +91,12 @@ def returns_of(
     points = scan.points
     boxed = np.zeros(len(points), bool) if scan.instance is None else scan.instance > 0
     _check_lasers(scan, rows, lasers)
+    if as_fired(replace(scan, sensor=lasers), rows) is not lasers:
+        raise DataError(
+            f"scan {scan.id!r}: a range image, with {lasers.columns} columns for the "
+            f"{lasers.firings} firings of {lasers.name!r}",
+            "scans with every return",
+        )
     dither = (rng.random(len(points), np.float32) - 0.5 * centred) * step
     bright = (scan.reflectance + dither).astype(np.float32)
     laser = rows.astype(np.int32)

@@ -57,7 +57,7 @@ def fit_skin(
     Raises:
         ConfigError: on an unknown sensor.
         DataError: on fewer than 5 scans, on scans of another sensor, not in ring order, or without
-            reflectance.
+            reflectance; on range images with fewer columns than the sensor fires.
 
     Example:
         >>> from lidar_synth import Town, fit_skin
