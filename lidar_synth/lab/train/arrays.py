@@ -192,8 +192,8 @@ def _check_blocks(
         scans = ({n: a[i] for n, a in arrays.items()} for i in blocks[number])
         return sums[number] == _join(_sum(scan) for scan in scans)
 
-    found = zip(noted, ranks.map(intact, noted), strict=True)
-    damaged = [number for number, whole in found if not whole]
+    whole = ranks.map(intact, noted)
+    damaged = [n for n, fine in zip(noted, whole, strict=True) if not fine]
     for number in damaged:
         sums[number] = None
     if damaged and ranks.first:

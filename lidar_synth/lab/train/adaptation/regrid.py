@@ -96,25 +96,24 @@ def regrid(model: Checkpoint, sensor: Sensor) -> tuple[Header, dict[str, nn.Modu
         ConfigError: on an autoencoder alone, a model with another condition, or one of an
             architecture that is not in ``PLACED``.
     """
-    check_movable(model.header)
+    header = model.header
+    check_movable(header)
     networks: dict[str, nn.Module] = {}
     parts: dict[str, NetworkSpec] = {}
     state = sensor.shape
     # the autoencoder first: it gives the shape of the states
     for name in sorted(model.networks):
-        part = model.header.networks[name]
+        part = header.networks[name]
         sizes = {"resolution": list(state if name == VELOCITY else sensor.shape)}
         if name == ENCODER:
             sizes["target"] = list(state)
         parts[name] = NetworkSpec(part.architecture, part.arguments | sizes)
         networks[name] = _moved(
-            model.networks[name], parts[name], model.header.sensor, sensor
+            model.networks[name], parts[name], header.sensor, sensor
         )
         if name == CODEC:
-            state = make_codec(
-                networks[CODEC], model.header.tensors, sensor.shape
-            ).shape[1:]
-    return replace(model.header, networks=parts, sensor=sensor), networks
+            state = make_codec(networks[CODEC], header.tensors, sensor.shape).shape[1:]
+    return replace(header, networks=parts, sensor=sensor), networks
 
 
 def check_movable(header: Header) -> None:
