@@ -287,15 +287,14 @@ def _check_held(
 ) -> None:
     """What the configuration says, if it says it, has to be what the checkpoint holds: sensor,
     channels, normalisation, and the part ``network``."""
+    limits = header.normalisation
     held: dict[str, Any] = {
-        "sensor": header.sensor.to_dict(),
+        "sensor": limit_ranges(header.sensor, limits).to_dict(),
         "channels": header.channels,
-        "normalisation": header.normalisation.to_dict(),
+        "normalisation": limits.to_dict(),
     }
     asked: dict[str, Any] = {
-        "sensor": limit_ranges(
-            load_sensor(config.sensor), header.normalisation
-        ).to_dict(),
+        "sensor": limit_ranges(load_sensor(config.sensor), limits).to_dict(),
         "channels": config.channels,
         "normalisation": config.tensors().normalisation.to_dict(),
     }
