@@ -7,11 +7,9 @@ processes may share a folder; a file that cannot be read is made again.
 
 import hashlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +18,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import sha256, write_arrays
 from lidar_synth.files.parsing import read_arrays
+from lidar_synth.files.processes import map_in_processes
 from lidar_synth.geometry.scan import Scan, Source, scan_hash
 
 VERSION = 1
@@ -135,38 +134,34 @@ def extract_all(
 
     Raises:
         DataError: on an empty source, and as the extractor.
+        ProcessError: as ``map_in_processes``.
     """
     parts = [
         range(i, min(i + batch, len(source))) for i in range(0, len(source), batch)
     ]
     if not parts:
         raise DataError("no scans", "at least one")
-    if processes == 1:
-        _start(make, source, more, None)
-        try:
-            return np.concatenate([_extract(part) for part in parts])
-        finally:
-            _state.clear()
+    processes = min(processes, len(parts))
     threads = max(1, torch.get_num_threads() // processes)
-    with ProcessPoolExecutor(
-        processes, get_context("spawn"), _start, (make, source, more, threads)
-    ) as pool:
-        return np.concatenate(list(pool.map(_extract, parts)))
+    work = _Extraction(make, source, more, threads)
+    with map_in_processes(work, parts, processes) as features:
+        return np.concatenate(list(features))
 
 
-_state: dict[
-    str, Any
-] = {}  # of a process: its extractor, the source and the further arguments
+@dataclass(frozen=True)
+class _Extraction:
+    """The features of a part of a source, by an extractor that each process makes once."""
 
+    make: Callable[[], Callable[..., NDArray[np.floating]]]
+    source: Source
+    more: tuple[bool, ...]
+    threads: int
 
-def _start(
-    make: Callable[[], Any], source: Source, more: tuple[bool, ...], threads: int | None
-) -> None:
-    if threads is not None:
-        torch.set_num_threads(threads)
-    _state.update(extract=make(), source=source, more=more)
+    @cached_property
+    def _extract(self) -> Callable[..., NDArray[np.floating]]:
+        torch.set_num_threads(self.threads)
+        return self.make()
 
-
-def _extract(indices: range) -> NDArray[np.floating]:
-    scans = [_state["source"][i] for i in indices]
-    return checked(_state["extract"], scans, *_state["more"])
+    def __call__(self, part: range) -> NDArray[np.floating]:
+        scans = [self.source[i] for i in part]
+        return checked(self._extract, scans, *self.more)
