@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import fsspec
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -117,6 +118,16 @@ def test_a_bank_is_read_through_the_proxy_of_the_environment(
         monkeypatch.delenv(name, raising=False)
     far = Bank("http://bank.invalid/bank")
     assert np.array_equal(far[1].points, Bank(tmp_path / "bank")[1].points)
+
+
+def test_what_fsspec_is_configured_with_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    login = {"headers": {"authorization": "Bearer token"}}
+    monkeypatch.setitem(fsspec.config.conf, "http", {"client_kwargs": login})
+    for scheme in ("http", "https"):
+        system, _ = storage.open_system(f"{scheme}://bank.invalid/bank")
+        assert system.client_kwargs == {"trust_env": True} | login
 
 
 def test_a_server_without_ranges_is_refused(served: Served) -> None:

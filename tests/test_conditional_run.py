@@ -38,6 +38,7 @@ from lidar_synth.generate.loading import load_generator
 from lidar_synth.lab.town import Town
 from lidar_synth.lab.train.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.lab.train.runs import open_stage
+from lidar_synth.lab.train.student import target_flow
 
 TRANSFORMER = {
     "architecture": "hdit",
@@ -120,6 +121,15 @@ def test_gaps_stay_in_label_maps_where_the_model_has_learnt_them(
             read = CONDITIONS["semantic"].read(source[i], sensor, seen.shape, options)
             assert np.array_equal(read, seen)
             assert not np.array_equal(seen, bridge_gaps(seen))
+    # A model that fills gaps may be its weaker one: both have seen them in training.
+    own = tmp_path / "own.safetensors"
+    save_checkpoint(own, stage.header, stage.parts(stage.network))
+    given = {"teacher": str(own), "weaker": str(start), "guidance": 2}
+    config = load_config(
+        DistillConfig, write_config(scans, tmp_path, "student", **given)
+    )
+    _, made = target_flow(config, load_checkpoint(own), "cpu")
+    assert made["weaker"] == load_checkpoint(start).hash
 
 
 @pytest.fixture(scope="module")

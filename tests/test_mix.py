@@ -134,6 +134,8 @@ def test_short_passes_over_the_same_batches_are_warned_about(workers: int) -> No
             ids(islice(loader, 2))
         with pytest.raises(UserWarning, match=r"epoch 1 .* set_epoch.* epoch_size=N"):
             next(iter(loader))
+        test = MixedScans(Scans("r", 9), ratio=0).loader(batch_size=4)
+        assert ids(islice(test, 2)) == ids(islice(test, 2))
 
 
 def test_a_pass_of_counted_batches_is_followed_by_the_next_epoch() -> None:

@@ -60,12 +60,18 @@ def test_view_writes_a_page_where_there_is_no_screen(view: View) -> None:
     assert scan["count"] == 400
 
 
-def test_view_shows_no_scan_twice_if_it_skips_one(view: View, tmp_path: Path) -> None:
-    (tmp_path / "data" / "000001.bin").write_bytes(b"cut")
-    with pytest.warns(UserWarning, match="skipped scan 000001"):
-        view("--count", "3", "--on-bad", "skip", "--out", "out.html")
+@pytest.mark.parametrize(
+    ("cut", "count", "ids"),
+    [("000001", 3, ["000000", "000002"]), ("000000", 1, ["000001"])],
+)
+def test_view_shows_the_next_scans_if_it_skips_one(
+    view: View, tmp_path: Path, cut: str, count: int, ids: list[str]
+) -> None:
+    (tmp_path / "data" / f"{cut}.bin").write_bytes(b"cut")
+    with pytest.warns(UserWarning, match=f"skipped scan {cut}"):
+        view("--count", count, "--on-bad", "skip", "--out", "out.html")
     page = page_data(Path("out.html").read_text(encoding="utf-8"))
-    assert [scan["id"] for scan in page["scans"]] == ["000000", "000002"]
+    assert [scan["id"] for scan in page["scans"]] == ids
 
 
 @pytest.mark.slow

@@ -229,8 +229,12 @@ def open_system(url: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        # With the proxies that the environment names.
-        options = {"client_kwargs": {"trust_env": True}} if scheme[:4] == "http" else {}
+        options = {}
+        if scheme in ("http", "https"):
+            kind = fsspec.get_filesystem_class(scheme)
+            configured = fsspec.config.apply_config(kind, {}).get("client_kwargs", {})
+            # With the proxies that the environment names.
+            options["client_kwargs"] = {"trust_env": True} | configured
         system, path = fsspec.core.url_to_fs(url, **options)
         _SYSTEMS[id(system)] = system
     except ImportError as error:

@@ -1,5 +1,6 @@
 """``lidar-synth view``: shows scans."""
 
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,7 +79,7 @@ def _read(source: "ScanFiles", index: int, count: int) -> "list[Scan]":
             f"--index {index}: {source.root} holds {len(source)} scans",
             f"0 .. {len(source) - 1}",
         )
-    chosen = range(first, min(first + count, len(source)))
-    read = map(source.load_or_skip, chosen)
-    bar = tqdm(read, "reading", len(chosen), unit="scan", disable=len(chosen) < 8)
-    return [scan for scan in bar if scan is not None]
+    count = min(count, len(source) - first)
+    read = map(source.load_or_skip, range(first, len(source)))
+    found = islice((scan for scan in read if scan is not None), count)
+    return list(tqdm(found, "reading", count, unit="scan", disable=count < 8))

@@ -16,8 +16,9 @@ class MixedLoader(DataLoader[Any]):
 
     Each pass is one epoch, from the mixture's own or that of a loaded state on; ``set_epoch`` of
     the loader or of the mixture chooses another. A pass that is left early is begun again by the
-    next one, with a warning unless it was left after one batch: passes of some batches each would
-    train on the same ones for ever. In a distributed training each rank gets its share.
+    next one, with a warning unless it was left after one batch, or the scans are real ones alone:
+    passes of some batches each would train on the same ones for ever. In a distributed training
+    each rank gets its share.
 
     Args:
         dataset: a ``MixedScans``.
@@ -72,7 +73,8 @@ class MixedLoader(DataLoader[Any]):
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
         epoch = self.epoch
         begun, done = self._pass
-        if begun == epoch and done > 1:  # after one, a user has looked at it
+        # After one batch, a user has looked at it; real scans alone may be for tests.
+        if begun == epoch and done > 1 and self._mixed.synthetic:
             warnings.warn(REPEATED.format(epoch), stacklevel=2)
         self.set_epoch(epoch)
         # Counted before each batch is yielded: a loop that takes as many batches as there are never

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names
+from lidar_synth.geometry.projection.kernels import grid_of
 from lidar_synth.geometry.scan import Boxes, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
@@ -25,7 +26,6 @@ from lidar_synth.geometry.transfer.surfaces import (
     ScanSurfaces,
     as_fired,
     estimate,
-    rings_of,
 )
 from lidar_synth.geometry.transfer.sweeps import moved
 from lidar_synth.noise import keyed_rng
@@ -143,12 +143,12 @@ class Transfer:
         ):
             return None
         distance = np.linalg.norm(scan.points, axis=1)
-        limits = self.target.range_min, self.target.range_max
-        inside = np.clip(distance, *limits) == distance
+        grid = grid_of(self.target)
+        inside = (distance >= grid.range_min) & (distance <= grid.range_max)
         if not inside.any() or not np.isfinite(distance).all():
             return None
-        fired_by = as_fired(scan, rings_of(scan)[0])
-        fired = sorted(s.firings or s.columns for s in (fired_by, self.target))
+        sensors = (as_fired(scan), self.target)
+        fired = sorted(s.firings or s.columns for s in sensors)
         if fired[0] < 0.9 * fired[1]:
             return None
         kept = scan[inside]
@@ -315,7 +315,7 @@ def _warn_of_differences(
 ) -> None:
     """Say once what scans of the target will lack: lasers outside the field of view, and its own
     reflectance."""
-    if given.name == target.name:
+    if given.name == target.name or target.same_lasers(given):
         return
     elevation = np.degrees(target.optics()[0]) - pitch
     seen = np.degrees(given.optics()[0])

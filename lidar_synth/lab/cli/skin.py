@@ -61,7 +61,8 @@ def fit_from_scans(
         raise ConfigError(f"--out {out}", "a name that ends in .skin")
     source = open_scans(scans, sensor=sensor, **drop_missing(reading))
     count = min(most, len(source))
-    picked = [source[i * len(source) // count] for i in range(count)]
+    read = (source.load_or_skip(i * len(source) // count) for i in range(count))
+    picked = [scan for scan in read if scan is not None]
     learnt = fit_skin(
         picked,
         licence=licence,

@@ -185,9 +185,19 @@ def _take_start(
 
 def _differences(one: Checkpoint, other: Checkpoint) -> list[str]:
     """Which of what decides the states and the conditions of a flow differs between two models."""
-    shared = ("sensor", "channels", "normalisation", "conditioning")
+    shared = ("sensor", "channels", "normalisation")
     found = [k for k in shared if getattr(one.header, k) != getattr(other.header, k)]
+    if _shown(one) != _shown(other):
+        found.append("conditioning")
     return found if _same_latents(one, other) else [*found, "autoencoder"]
+
+
+def _shown(model: Checkpoint) -> dict[str, dict[str, Any]]:
+    """The conditions of a model, as training shows them: with their gaps."""
+    return {
+        name: options | {"keep_gaps": True}
+        for name, options in model.header.conditioning.items()
+    }
 
 
 def _same_latents(one: Checkpoint, other: Checkpoint) -> bool:

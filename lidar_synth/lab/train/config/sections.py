@@ -209,7 +209,7 @@ class ConditionSection(Section):
         focal: focal length of the camera in pixels, which the dataset's calibration has to confirm.
         views: views side by side in the image that are resized one by one, as in LiDM.
         keep_gaps: whether narrow gaps in label maps are kept when a scan is generated, as they are
-            in training; those of a model trained on ``data.path`` always are.
+            in training; those of a teacher trained on ``data.path`` always are.
     """
 
     kind: Literal["semantic", "camera", "layout"]
