@@ -65,7 +65,7 @@ def test_a_latent_model_of_label_maps_generates(codec: Path, teacher: Path) -> N
     assert header.networks[VELOCITY].arguments["channels"] == 4
     assert header.networks[VELOCITY].arguments["resolution"] == [4, 8]
     assert header.networks[VELOCITY].arguments["condition_channels"] == 3
-    assert header.conditioning == {"semantic": {"dropout": 0.2}}
+    assert header.conditioning == {"semantic": {"dropout": 0.2, "keep_gaps": True}}
     assert header.provenance["codec"] == load_checkpoint(codec).hash
     for a, b in zip(
         networks[CODEC].parameters(),
