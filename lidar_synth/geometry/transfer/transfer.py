@@ -22,11 +22,7 @@ from lidar_synth.geometry.transfer.returns import (
     gather_hits,
     place_returns,
 )
-from lidar_synth.geometry.transfer.surfaces import (
-    ScanSurfaces,
-    as_fired,
-    estimate,
-)
+from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, as_fired, estimate
 from lidar_synth.geometry.transfer.sweeps import moved
 from lidar_synth.noise import keyed_rng
 
