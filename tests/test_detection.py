@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,19 @@ from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.lab.proof.arms import EPOCHS
-from lidar_synth.lab.proof.detection import ARMS, DetectionSettings, prove_detection
+from lidar_synth.lab.proof.detection import (
+    ARMS,
+    DetectionSettings,
+    prove_detection,
+    study,
+)
 from lidar_synth.lab.proof.detection.arms import make_mixture
 from lidar_synth.lab.proof.detection.bev import CHANNELS, Found
 from lidar_synth.lab.proof.detection.network import Detector, detect
+from lidar_synth.lab.proof.detection.page import describe, format_table
 from lidar_synth.lab.proof.detection.scores import Criterion, Truth, judge, precision_of
 from lidar_synth.lab.proof.detection.study import DetectionWork, half_of
-from lidar_synth.lab.proof.detection.summary import interval_of, summarise
+from lidar_synth.lab.proof.detection.summary import summarise
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -69,8 +76,8 @@ def test_a_network_is_not_tested_by_the_statistics_of_one_scan() -> None:
     torch.manual_seed(0)
     network = Detector()
     some = torch.randint(0, 255, (64, 64, CHANNELS), dtype=torch.uint8)
-    [expected] = detect(network.eval(), lambda i: some, 1)
-    [after_training] = detect(network.train(), lambda i: some, 1)
+    [expected] = detect(network.eval(), [some])
+    [after_training] = detect(network.train(), [some])
     assert len(expected.scores)
     assert np.array_equal(after_training.scores, expected.scores)
 
@@ -114,9 +121,32 @@ def test_an_arm_that_is_better_at_two_places_has_a_wide_interval() -> None:
     assert low == 0 < row["difference"] < high < 100
 
 
-def test_few_places_give_no_interval() -> None:
-    judged = [[[judge(found(CAR), truth(CAR), 0, Criterion(0.5))]]]
-    assert interval_of(judged, judged) is None
+@pytest.mark.parametrize(("places", "seeds"), [(1, 1), (2, 6), (3, 4), (5, 4), (6, 2)])
+def test_an_interval_needs_six_places_however_many_seeds(
+    places: int, seeds: int
+) -> None:
+    names = {f"p{i}": [i] for i in range(places)}
+    tested = {s: {n: names[n] for n in half_of(names, s)} for s in range(seeds)}
+    base = {s: {i: found(FAR) for i in range(places)} for s in tested}
+    truths = {i: truth(CAR) for i in range(places)}
+    made = summarise({"gt_sampling": base, "first": base}, truths, tested)
+    interval = made["classes"]["car"]["arms"]["first"]["interval"]
+    assert (interval is not None) == (places == 6)
+
+
+def test_a_class_counts_in_the_seeds_and_comparisons_that_test_it() -> None:
+    """A car in one half of the places, and a cyclist in none that is tested."""
+    cyclist = replace(truth(CAR), classes=np.array([2]))
+    truths = {0: truth(CAR), 1: truth(), 2: cyclist}
+    tested = {0: {"a": [0]}, 1: {"b": [1]}}
+    base = {seed: {seed: found(FAR)} for seed in tested}
+    better = {seed: {seed: found(CAR)} for seed in tested}
+    made = summarise({"gt_sampling": base, "first": better}, truths, tested)
+    assert list(made["classes"]) == ["car"]
+    row = made["classes"]["car"]["arms"]["first"]
+    assert row["by_seed"] == [100, None] and row["difference"] == 100
+    json.dumps(made, allow_nan=False)
+    assert "| 100.0, – | 100.0 | +100.0 | – |" in format_table(made)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +204,7 @@ def test_a_comparison_from_scans_to_page(places: Path, tmp_path: Path) -> None:
     made = json.loads((tmp_path / "out" / "results-2.json").read_text())
     assert set(made["places"]) == {f"place{i}" for i in range(4)}
     page = (tmp_path / "out" / "index.html").read_text()
-    assert "Label budget: 2 scans" in page and "<svg" in page
+    assert "Label budget: 2 real scans with boxes" in page and "<svg" in page
     runs = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").iterdir()}
     assert len(runs) == 4
     CliRunner().invoke(app, command)  # it resumes: nothing is trained
@@ -208,6 +238,70 @@ def test_of_a_larger_pool_the_first_scans_are_taken(tmp_path: Path) -> None:
     settings = DetectionSettings(synthetic=2)
     town = DetectionWork([street(0)], settings, tmp_path / "out", tmp_path).town
     assert [town[i].id for i in range(len(town))] == ["000000", "000001"]
+
+
+def test_a_pool_and_a_comparison_are_of_one_sensor(tmp_path: Path) -> None:
+    write_scan(tmp_path / "pool" / "000000.npz", street(10))
+    scan = street(0)
+    other = replace(scan, sensor=replace(scan.sensor, name="other", fov_up=5.0))
+    settings = DetectionSettings(synthetic=1)
+    first, second = (
+        DetectionWork([one], settings, tmp_path / "out", tmp_path / "pool")
+        for one in (scan, other)
+    )
+    assert len(first.town) == 1
+    with pytest.raises(ConfigError, match="was filled with"):
+        _ = second.town
+    assert study._identity(first) != study._identity(second)
+
+
+class Drives:
+    """Eight drives of a scan each, read anew each time; ``most`` is the highest number of scans
+    that were in memory at once."""
+
+    def __init__(self) -> None:
+        self.ids = [f"p{i}/0" for i in range(8)]
+        self.read: list[weakref.ref[Scan]] = []
+        self.most = 0
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, index: int) -> Scan:
+        scan = replace(street(index), id=self.ids[index])
+        self.read.append(weakref.ref(scan))
+        self.most = max(self.most, sum(one() is not None for one in self.read))
+        return scan
+
+
+def test_tested_scans_are_read_one_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study, "train", lambda *_: [0.0] * 10)
+    source = Drives()
+    settings = DetectionSettings(labelled=1, iterations=10)
+    work = DetectionWork(source, settings, tmp_path, tmp_path)
+    assert len(work.run("real", 0)["found"]) == 4
+    assert source.most <= 3  # that to train on, one, and the one before it
+
+
+def test_a_plan_reads_no_scan_and_the_page_has_the_labelled_scans_of_each_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = Drives()
+    source.ids = source.ids[:3]
+    settings = DetectionSettings(labelled=100, arms=("real",))
+    work = DetectionWork(source, settings, tmp_path, tmp_path)
+    assert "3 scans in 3 places" in study.describe(work)
+    assert not source.read
+    empty = {"boxes": [], "scores": [], "classes": []}
+    monkeypatch.setattr(
+        DetectionWork,
+        "run",
+        lambda *_: {"found": {str(i): empty for i in range(3)}},
+    )
+    made = prove_detection(source, tmp_path / "out", settings)
+    assert "on the same 1 to 2 real scans with boxes" in describe(made)
 
 
 def test_scans_without_boxes_are_refused(tmp_path: Path) -> None:
@@ -244,16 +338,20 @@ def test_a_scan_with_boxes_along_the_way_of_a_car_is_named(
     write_scan(tmp_path / "trail" / "0.npz", replace(scan, boxes=trail))
     for folder in places.iterdir():
         shutil.copytree(folder, tmp_path / folder.name)
-    command = ["prove", str(tmp_path), "--task", "detection", "--dry-run"]
-    result = CliRunner().invoke(app, command)
-    assert result.exit_code == 0, result.output
+    with pytest.raises(DataError, match="no seed"):
+        prove_detection(tmp_path, tmp_path / "out", minutes=0)
     [warning] = caplog.messages
     assert "trail/0: 6 of 6 boxes overlap one of their class" in warning
 
 
-def test_options_of_the_other_task_are_refused(places: Path, tmp_path: Path) -> None:
-    command = ["prove", str(places), "--task", "detection", "--only", "car"]
+@pytest.mark.parametrize(
+    ("option", "value"), [("--only", "car"), ("--model", "none"), ("--classes", "none")]
+)
+def test_options_of_the_other_task_are_refused(
+    places: Path, tmp_path: Path, option: str, value: str
+) -> None:
+    command = ["prove", str(places), "--task", "detection", option, value, "--dry-run"]
     result = CliRunner().invoke(app, [*command, "--out", str(tmp_path)])
     assert isinstance(result.exception, ConfigError)
     message = str(result.exception)
-    assert "--only" in message and "Did you mean" not in message
+    assert option in message and "Did you mean" not in message

@@ -263,11 +263,7 @@ def make_test(work: Work) -> Test:
 
     def test(network: nn.Module) -> list[float]:
         return precisions(
-            detect(
-                network,
-                lambda i: view(scans[i].points, scans[i].reflectance),
-                len(scans),
-            ),
+            detect(network, (view(scan.points, scan.reflectance) for scan in scans)),
             truths,
         )
 

@@ -135,6 +135,8 @@ def prove(
             "--ratio": ratio,
             "--only": only,
             "--beams": beams,
+            "--model": model != "town",
+            "--classes": classes != "auto",
         }
         _check_task(task, [name for name, given in further.items() if given])
         options = {

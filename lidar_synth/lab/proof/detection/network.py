@@ -1,7 +1,7 @@
 """The detector: a convolutional network in bird's-eye view with CenterPoint's head, its training
 and its test."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import islice
 
 import numpy as np
@@ -177,14 +177,13 @@ def train(
 
 def detect(
     network: nn.Module,
-    views: Callable[[int], Tensor],
-    count: int,
+    views: Iterable[Tensor],
 ) -> list[Found]:
-    """The boxes that a network finds in views 0 to ``count`` - 1; it is left in evaluation mode."""
+    """The boxes that a network finds in each view; it is left in evaluation mode."""
     network.eval()
     every = []
     with torch.no_grad():
-        for i in range(count):
-            logits, values = answer(network, views(i)[None])
+        for seen in views:
+            logits, values = answer(network, seen[None])
             every.append(decode(logits[0].sigmoid().cpu(), values[0].cpu()))
     return every

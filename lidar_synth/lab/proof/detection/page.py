@@ -47,7 +47,7 @@ def describe(values: Values) -> str:
     """One paragraph for a reader who has never seen such a comparison."""
     return (
         f"The same small detector was trained in {len(values['arms'])} ways on the same "
-        f"{values['labelled']} real scans with boxes, and tested on places that it had not seen. "
+        f"{values['labelled']} with boxes, and tested on places that it had not seen. "
         "Each seed leaves out one half of the places, so that two seeds test on all."
     )
 
@@ -59,7 +59,7 @@ def protocol(values: Values) -> list[str]:
     budgets = [f"{arm['title']}: {arm['budget']}" for arm in values["arms"]]
     return [
         f"Tested places and their scans: {', '.join(places)}.",
-        f"Label budget: {values['labelled']} scans with boxes; besides them, {'; '.join(budgets)}.",
+        f"Label budget: {values['labelled']} with boxes; besides them, {'; '.join(budgets)}.",
         f"{settings['iterations']} iterations of {settings['batch']} scans, {settings['seeds']} "
         "seeds; boxes with 5 returns have to be found, others may be.",
         f"Sensor: {values['sensor']}. Machine: {values['machine']}. Date: {values['date']}.",
@@ -111,7 +111,7 @@ def format_table(values: Values) -> str:
             row = found["arms"][arm["arm"]]
             cells = [
                 arm["title"],
-                ", ".join(map(str, row["by_seed"])),
+                ", ".join(map(_number, row["by_seed"])),
                 _number(row[MAIN]),
                 format_signed(row["difference"]),
                 span(row["interval"]) if row["difference"] is not None else "",

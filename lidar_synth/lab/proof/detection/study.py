@@ -23,7 +23,7 @@ from lidar_synth.formats.camera_boxes import CameraBoxes
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.generate.devices import check_device
 from lidar_synth.geometry.overlap import count_overlapping
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry.scan import Source
 from lidar_synth.lab.proof.arms import EPOCHS
 from lidar_synth.lab.proof.detection.arms import (
     ARMS,
@@ -44,8 +44,10 @@ from lidar_synth.lab.proof.detection.summary import summarise
 from lidar_synth.lab.proof.machine import command_line, machine
 from lidar_synth.lab.proof.page import write_body
 from lidar_synth.lab.proof.places import Places, choose, find_places, names_of
-from lidar_synth.lab.proof.pools import TOWN_SEED
+from lidar_synth.lab.proof.plan import count_scans
+from lidar_synth.lab.proof.pools import SETTINGS, TOWN_SEED
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
+from lidar_synth.lab.town.catalogue import TABLES_HASH
 from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels import ObjectBank
 
@@ -146,17 +148,23 @@ class DetectionWork:
 
     @cached_property
     def town(self) -> Source:
-        """Scans of the town by the sensor of the real scans, kept in ``pool``."""
+        """Scans of the town by the sensor of the real scans, kept in ``pool``.
+
+        Raises:
+            ConfigError: if the folder holds those of another sensor or version of the town.
+        """
+        sensor = self.source[0].sensor
+        identity = {"sensor": sensor.to_dict(), "tables": TABLES_HASH}
+        claim(self.pool / SETTINGS, identity)
         count = self.settings.synthetic
         stretches = -(-count // len(MOMENTS))
         town = Town(
             TOWN_SEED,
-            self.source[0].sensor,
+            sensor,
             stretches * STRETCH_FRAMES,
             interval=2.0,
             motion=False,
         )
-        self.pool.mkdir(parents=True, exist_ok=True)
         for number in tqdm(range(count), "scans of the town", disable=None):
             path = self.pool / f"{number:06d}.npz"
             stretch, moment = divmod(number, len(MOMENTS))
@@ -173,13 +181,13 @@ class DetectionWork:
         bank: ObjectBank = ObjectBank.from_town(self.source[0].sensor)
         return bank
 
-    def labelled(self, seed: int) -> list[Scan]:
-        """The real scans that a seed trains on, from the places that it does not test."""
+    def labelled(self, seed: int) -> list[int]:
+        """Indices of the scans that a seed trains on, from the places that it does not test."""
         held_out = half_of(self.places, seed)
         others = {n: i for n, i in self.places.items() if n not in held_out}
         rng = np.random.default_rng((seed, self.settings.labelled))
         count = min(self.settings.labelled, sum(map(len, others.values())))
-        return [self.source[i] for i in choose(others, "", count, rng)]
+        return choose(others, "", count, rng)
 
     def tested(self, seed: int) -> dict[str, list[int]]:
         """{place: indices of its scans} that a seed tests on."""
@@ -203,7 +211,7 @@ class DetectionWork:
         start = time.monotonic()
         torch.manual_seed(seed)
         network = Detector().to(self.device)
-        labelled = self.labelled(seed)
+        labelled = [self.source[i] for i in self.labelled(seed)]
         epoch_size = self.settings.batch * max(1, self.settings.iterations // EPOCHS)
         town = self.town if arm.ratio != 0 else None
         objects = self.objects if set(arm.pasted) - {OWN} else None
@@ -237,12 +245,9 @@ class DetectionWork:
     ) -> dict[str, Any]:
         """{index of a tested scan: what is found in it}, as plain values."""
         indices = [i for part in self.tested(seed).values() for i in part]
-        scans = [self.source[i] for i in indices]
-        found = detect(
-            network,
-            lambda i: view(scans[i].points, scans[i].reflectance),
-            len(scans),
-        )
+        # One at a time: half of the places may be more than the memory holds.
+        scans = (self.source[i] for i in indices)
+        found = detect(network, (view(s.points, s.reflectance) for s in scans))
         return {
             str(index): {name: values.tolist() for name, values in vars(one).items()}
             for index, one in zip(indices, found, strict=True)
@@ -342,13 +347,12 @@ def _truths(source: Source) -> dict[int, Truth]:
 
 
 def describe(work: DetectionWork) -> str:
-    """What would be trained and tested, in words.
+    """What would be trained and tested, in words, without a look at the boxes.
 
     Raises:
-        ConfigError, DataError: as ``prove_detection``.
+        ConfigError, DataError: as ``find_places``.
     """
     settings = work.settings
-    _truths(work.source)
     counts = [f"{name} ({len(part)})" for name, part in work.places.items()]
     trainings = settings.seeds * len(settings.compared)
     lines = [
@@ -371,6 +375,7 @@ def _identity(work: DetectionWork) -> dict[str, Any]:
         del own[name]
     scans = hash_of_names(names_of(work.source))
     own |= getattr(work.source, "options", {})
+    own["sensor"] = work.source[0].sensor.to_dict()
     # Protocol 1 had another schedule; 2 settled each network. Their folders are refused.
     return {"scans": scans, "protocol": 3, **own}
 
@@ -395,7 +400,7 @@ def report(
     found = {name: {seed: work.outcome(name, seed) for seed in seeds} for name in names}
     values = summarise(found, truths, {seed: work.tested(seed) for seed in seeds})
     values |= {
-        "labelled": work.settings.labelled,
+        "labelled": count_scans([len(work.labelled(s)) for s in seeds], "real scan"),
         "settings": asdict(work.settings),
         "sensor": work.source[0].sensor.name,
         "machine": machine(work.device),

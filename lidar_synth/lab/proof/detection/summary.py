@@ -17,6 +17,7 @@ from lidar_synth.lab.proof.detection.scores import (
     judge,
     precision_of,
 )
+from lidar_synth.lab.proof.scores import FEWEST_PLACES
 
 CRITERIA = {
     "overlap 0.5": Criterion(0.5),
@@ -29,8 +30,6 @@ CRITERIA = {
 MAIN = "overlap 0.5"
 """The criterion of the paired differences."""
 DRAWS = 2000
-FEWEST_PLACES = 6
-"""Tested places from which an interval is given."""
 
 Outcomes = Mapping[int, Mapping[int, Found]]
 """{seed: {index of a tested scan: what is found in it}} of an arm."""
@@ -50,16 +49,15 @@ def summarise(
     Args:
         found: {arm: outcomes}; ``BASE`` is one of them.
         truths: the boxes of every scan by its index.
-        tested: what each seed tests on.
+        tested: what each seed tests on; classes without a box there are left out.
     """
-    classes = [
+    wanted = {
         number
-        for number in range(len(CLASSES))
-        if any(
-            (truth.wanted & (truth.classes == number)).any()
-            for truth in truths.values()
-        )
-    ]
+        for places in tested.values()
+        for scans in places.values()
+        for i in scans
+        for number in truths[i].classes[truths[i].wanted].tolist()
+    }
     names = list(CLASSES)
     return {
         "arms": [
@@ -70,7 +68,8 @@ def summarise(
             name: len(scans) for part in tested.values() for name, scans in part.items()
         },
         "classes": {
-            names[each]: _of_class(found, truths, tested, each) for each in classes
+            names[each]: _of_class(found, truths, tested, each)
+            for each in sorted(wanted)
         },
     }
 
@@ -98,13 +97,16 @@ def _of_class(
             each,
             CRITERIA[MAIN],
         )
-        by_seed = [_percent(a) - _percent(b) for a, b in zip(own, base, strict=True)]
+        changes = [_percent(a) - _percent(b) for a, b in zip(own, base, strict=True)]
+        by_place = _by_place(own, tested)
+        judged = sum(value is not None for value in by_place.values())
         other = arm != BASE
+        enough = other and judged >= FEWEST_PLACES
         table[arm] = {
-            "by_seed": [round(_percent(one), 1) for one in own],
-            "difference": round(float(np.mean(by_seed)), 1) if other else None,
-            "interval": interval_of(own, base) if other else None,
-            "by_place": _by_place(own, tested),
+            "by_seed": [_mean([one]) for one in own],
+            "difference": round(float(np.nanmean(changes)), 1) if other else None,
+            "interval": interval_of(own, base) if enough else None,
+            "by_place": by_place,
             **{
                 name: _mean(
                     _groups(
@@ -161,15 +163,12 @@ def interval_of(
     own: Groups,
     base: Groups,
     draws: int = DRAWS,
-) -> tuple[float, float] | None:
+) -> tuple[float, float]:
     """95 % interval of the mean difference of two arms, percentage points, by a bootstrap over the
     tested places of each seed.
 
-    The average precision is of all drawn places together. None with fewer than
-    ``FEWEST_PLACES`` places.
+    The average precision is of all drawn places together.
     """
-    if sum(map(len, own)) < FEWEST_PLACES:
-        return None
     rng = np.random.default_rng(0)
     values = [_draw(own, base, rng) for _ in range(draws)]
     low, high = np.nanquantile(values, (0.025, 0.975))
