@@ -170,10 +170,24 @@ def test_intensities_on_another_scale(tmp_path: Path) -> None:
     ]
     assert CliRunner().invoke(app, arguments).exit_code == 0
     assert np.allclose(open_scans(tmp_path / "out")[0].reflectance, points[:, 3] / 255)
-    with pytest.raises(
-        ConfigError, match=r"reflectance_max=255.* for .*--layout folder"
-    ):
-        open_scans(a_sequence(tmp_path / "kitti").parents[1], reflectance_max=255)
+    with pytest.raises(ConfigError, match=r"fields=5.* for .*--layout folder"):
+        open_scans(a_sequence(tmp_path / "kitti").parents[1], fields=5)
+
+
+@pytest.mark.parametrize("to", ["semantic_kitti", "kitti_object"])
+def test_intensities_on_another_scale_beside_labels(tmp_path: Path, to: str) -> None:
+    scan = some_scan(0)
+    write_all(to, tmp_path, [scan])
+    [path] = tmp_path.rglob("*.bin")
+    points = np.fromfile(path, "<f4").reshape(-1, 4)
+    (points * np.array([1, 1, 1, 255], "<f4")).tofile(path)
+    with pytest.raises(DataError, match="--reflectance-max 255"):
+        open_scans(tmp_path)[0]
+    source = open_scans(tmp_path, reflectance_max=255)
+    assert np.allclose(source[0].reflectance, scan.reflectance)
+    assert source.options == open_scans(tmp_path).options | {"reflectance_max": 255}
+    with pytest.raises(ConfigError, match="reflectance_max=0; expected above 0"):
+        open_scans(tmp_path, reflectance_max=0)
 
 
 def test_five_floats_per_point(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Writing and reading back, in every layout and format."""
 
 import json
+import re
+import struct
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -11,7 +13,8 @@ from layouts import MAKERS, WRITTEN_AS, some_camera, some_scan, write_all
 from roundtrips import back, same
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import DataError, LibraryError
+from lidar_synth.errors import ConfigError, DataError, LibraryError
+from lidar_synth.files.disk import files_below
 from lidar_synth.formats import (
     KITTI360,
     READERS,
@@ -20,7 +23,7 @@ from lidar_synth.formats import (
     SemanticKITTI,
     open_scans,
 )
-from lidar_synth.formats.cloud import STORED
+from lidar_synth.formats.cloud import LONGEST_PADDING, STORED
 from lidar_synth.formats.png import RangePNG
 from lidar_synth.formats.range_images import RangeImages
 from lidar_synth.geometry.projection import locate, project, unproject
@@ -149,6 +152,34 @@ def test_clouds_of_other_programs(
     path.write_text(f"{header}1 2 3 51\n")
     with pytest.raises(DataError, match="is truncated"):
         open_scans(path)[0]
+
+
+@pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
+def test_zeros_after_the_points_of_a_cloud_are_ignored(
+    tmp_path: Path, encoding: str
+) -> None:
+    """Earlier versions of PCL write a page of memory more than the points take."""
+    [path] = write_all("pcd", tmp_path, [some_scan()])
+    scan = open_scans(path)[0]
+    head, _, body = path.read_bytes().partition(b"DATA binary\n")
+    if encoding == "binary_compressed":
+        width = len(body) // len(scan)
+        records = np.frombuffer(body, np.uint8).reshape(-1, width)
+        sizes = re.search(rb"^SIZE (.*)$", head, re.M)
+        assert sizes is not None
+        ends = np.cumsum([int(size) for size in sizes[1].split()])[:-1]
+        plain = b"".join(part.tobytes() for part in np.split(records, ends, axis=1))
+        parts = [plain[i : i + 32] for i in range(0, len(plain), 32)]
+        packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
+        body = struct.pack("<II", len(packed), len(plain)) + packed
+    head += f"DATA {encoding}\n".encode()
+    for tail in (b"", bytes(4000), bytes(LONGEST_PADDING)):
+        path.write_bytes(head + body + tail)
+        assert same(open_scans(path)[0].points, scan.points)
+    for tail in (bytes(LONGEST_PADDING + 1), bytes(100) + b"1"):
+        path.write_bytes(head + body + tail)
+        with pytest.raises(DataError, match="more than its header declares"):
+            open_scans(path)[0]
 
 
 @needs_open3d
@@ -413,6 +444,41 @@ def test_links_to_folders_are_followed_but_not_in_circles(
     source = open_scans(folder)
     assert type(source) is READERS[WRITTEN_AS[to]]
     assert source.ids == ("b/000000",)
+
+
+def test_only_links_are_resolved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Many folders are listed in a moment."""
+    for number in range(3):
+        (tmp_path / str(number) / "lidar").mkdir(parents=True)
+        (tmp_path / str(number) / "lidar" / "a.bin").touch()
+    monkeypatch.setattr(Path, "resolve", lambda path: pytest.fail(str(path)))
+    assert len(list(files_below(tmp_path))) == 3
+
+
+def beside_clouds(root: Path, name: str, content: bytes) -> Path:
+    """A folder of PCD files beside which another file lies."""
+    write_all("pcd", root / "clouds", [some_scan()])
+    (root / name).write_bytes(content)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("backup.tar", bytes(10240)), ("index.json", b'{"frames": [1]}')],
+)
+def test_a_file_beside_clouds_does_not_decide_the_layout(
+    tmp_path: Path, name: str, content: bytes
+) -> None:
+    assert open_scans(beside_clouds(tmp_path, name, content)).ids == ("clouds/000000",)
+
+
+def test_clouds_are_no_range_images(tmp_path: Path) -> None:
+    root = beside_clouds(tmp_path, "x", b"")
+    np.save(root / "a_poses.npy", np.zeros((10, 4, 4)))
+    with pytest.raises(ConfigError, match=r"holds .npy and .pcd files.*the folder of"):
+        open_scans(root)
 
 
 @pytest.mark.parametrize("to", WRITERS)

@@ -1,5 +1,6 @@
 """Cameras, poses, labels and boxes in each layout."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +18,27 @@ from layouts import (
     write_all,
 )
 from roundtrips import back, same
-from streets import CAMERA, kitti
+from streets import CAMERA, kitti, street
 
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.datasets.classes import KITTI360 as KITTI360_CLASSES
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import read_named_matrices, write_named_matrices
 from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, KITTIRaw, open_scans
-from lidar_synth.formats.calibration import in_view
+from lidar_synth.formats.calibration import Calibration, ideal_camera, in_view
+from lidar_synth.formats.camera_boxes import assumed_size
+from lidar_synth.formats.convert import convert
 from lidar_synth.formats.point_labels import decode_labels, encode_labels
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.lab.proof.detection.study import with_boxes
+
+
+def test_a_byte_order_mark_is_no_part_of_a_class(tmp_path: Path) -> None:
+    write_all("kitti_object", tmp_path, [some_scan()])
+    names = open_scans(tmp_path)[0].boxes.names
+    path = tmp_path / "training/label_2/000000.txt"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert open_scans(tmp_path)[0].boxes.names == names
 
 
 @pytest.mark.parametrize("to", ["semantic_kitti", "kitti_object", "kitti360"])
@@ -294,6 +305,55 @@ def test_a_detector_gets_scans_with_boxes_in_the_view(tmp_path: Path) -> None:
         path.unlink()
     with pytest.raises(DataError, match="without boxes"):
         scans.with_boxes()
+
+
+@pytest.mark.parametrize("picture", [".png", ".jpg", None])
+def test_the_view_of_another_camera_is_not_taken_for_kittis(
+    tmp_path: Path, picture: str | None
+) -> None:
+    """Its size is that of its images, also if those are JPEG; without any, its projection tells
+    it."""
+    from PIL import Image
+
+    width = (
+        1920 if picture is None else 1800
+    )  # the principal point is not in the centre
+    camera = replace(ideal_camera(1000.0, (1920, 1080)), image_size=(width, 1080))
+    write_all("kitti_object", tmp_path / "own", [street(0)], calibration=camera)
+    image = tmp_path / "own/training/image_2/000000.png"
+    if picture == ".jpg":
+        Image.open(image).save(image.with_suffix(".jpg"))
+    if picture != ".png":
+        image.unlink()
+    source = KITTIObject(tmp_path / "own")
+    [whole] = source
+    [cropped] = source.with_boxes()
+    assert same(cropped.points, in_view(whole, camera).points)
+    convert(source, WRITERS["kitti_object"](tmp_path / "again"), progress=False)
+    again = open_scans(tmp_path / "again").calibration(0)
+    assert again is not None and again.image_size == (width, 1080)
+    boxes = (f"{n}/training/label_2/000000.txt" for n in ("own", "again"))
+    assert len({(tmp_path / path).read_text() for path in boxes}) == 1
+
+
+@pytest.mark.parametrize(
+    ("centre", "size"),
+    [
+        ((609.6, 172.9), (1242, 375)),
+        ((602.0, 183.0), (1242, 375)),
+        ((320, 240), (640, 480)),
+    ],
+)
+def test_the_size_of_an_image_follows_from_the_projection(
+    centre: tuple[float, float], size: tuple[int, int]
+) -> None:
+    projection = np.array(
+        [(700, 0, centre[0], 0), (0, 700, centre[1], 0), (0, 0, 1, 0)]
+    )
+    assert assumed_size(Calibration(projection, np.eye(4))) == size
+    projection[:2, 2] = 0
+    with pytest.raises(DataError, match="principal point of P2: an image of"):
+        assumed_size(Calibration(projection, np.eye(4)))
 
 
 def test_a_detector_gets_drives_with_tracklets_in_the_view(tmp_path: Path) -> None:

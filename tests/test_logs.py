@@ -98,6 +98,26 @@ def test_rings_become_rows_of_the_sensor_that_the_folder_names(tmp_path: Path) -
     assert np.array_equal(open_scans(tmp_path)[0].ring, scan.ring)
 
 
+@pytest.mark.parametrize("name", ["time", "t", "timestamp"])
+@pytest.mark.parametrize(
+    ("kind", "start", "unit"),
+    [
+        *(("f4", 0, 10**n) for n in (0, 3, 6, 9)),
+        *(("f8", 1.7e5, 10**n) for n in (0, 3, 6, 9)),
+        *(("u8", 1.7e5, 10**n) for n in (3, 6, 9)),
+    ],
+)
+def test_times_are_read_in_any_unit(
+    tmp_path: Path, name: str, kind: str, start: float, unit: int
+) -> None:
+    scan = rays(8)
+    time = np.linspace(0, 0.1, len(scan))
+    given = np.round((start + time) * unit, 5).astype(kind)
+    write_log(tmp_path / "a.pcd", {**axes(scan), "i": scan.reflectance, name: given})
+    read = open_scans(tmp_path, sensor=scan.sensor)[0].time
+    assert read is not None and np.allclose(read, time, atol=1.1 / max(unit, 1000))
+
+
 def test_labels_of_other_programs_are_not_taken_for_classes(tmp_path: Path) -> None:
     scan = rays(8)
     ones = np.ones(len(scan))

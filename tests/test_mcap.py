@@ -83,6 +83,20 @@ def test_rings_become_rows_of_the_sensor_that_the_folder_names(tmp_path: Path) -
     assert not np.array_equal(unknown[0].ring, given.ring)
 
 
+def test_a_cloud_without_any_return_is_skipped(tmp_path: Path) -> None:
+    lost = cloud(0, is_dense=False)
+    points = np.frombuffer(lost["data"], "<f4").reshape(-1, 12).copy()
+    points[:, :3] = np.nan
+    empty = lost | {"data": points.tobytes()}
+    record(tmp_path / "a.mcap", [("/points", 0, empty), ("/points", 1, cloud(1))])
+    with pytest.raises(DataError, match="a/000000 holds no points"):
+        MCAP(tmp_path)[0]
+    scans = MCAP(tmp_path, on_bad="skip")
+    scans.skip_sensor_check()
+    with pytest.warns(UserWarning, match="skipped scan a/000000"):
+        assert [scan.id for scan in scans] == ["a/000001"]
+
+
 def test_rows_may_have_bytes_at_their_ends(tmp_path: Path) -> None:
     plain = cloud(2)
     rows = np.frombuffer(plain["data"], np.uint8).reshape(8, -1)

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any, overload
 
 from lidar_synth.bank.cache import ShardCache
-from lidar_synth.bank.index import INDEX, REPAIR, Facts, Index
+from lidar_synth.bank.index import FORMAT, INDEX, REPAIR, Facts, Index
 from lidar_synth.bank.shard import ShardReader
 from lidar_synth.bank.storage import RemoteFile, bank_root, open_storage
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.disk import read_start
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import (
     REAL,
@@ -282,7 +283,10 @@ def _touch(shards: OrderedDict[int, ShardReader], number: int, most: int) -> Non
 
 def is_bank(path: str | Path) -> bool:
     """Whether a folder holds a bank, complete or damaged."""
-    return (Path(path) / INDEX).is_file() or any(Path(path).glob("shard-*.h5"))
+    index = Path(path) / INDEX  # other programs have files of this name
+    return any(index.parent.glob("shard-*.h5")) or (
+        index.is_file() and FORMAT[:-1] in read_start(index, 1 << 20)
+    )
 
 
 class _Names(Sequence[str]):

@@ -59,8 +59,8 @@ class Reading(BaseModel):
     )
     reflectance_max: float | None = Field(
         None,
-        description="highest reflectance value in plain files and MCAP, for instance 255 "
-        "[1; 255 in logs of drivers]",
+        description="highest reflectance value in plain files, MCAP, semantic_kitti and "
+        "kitti_object, for instance 255 [1; 255 in logs of drivers]",
     )
     on_bad: str | None = Field(
         None,

@@ -324,8 +324,11 @@ def files_below(folder: Path) -> Iterator[Path]:
     """
     for parent, folders, names in os.walk(folder, followlinks=True):
         here = Path(parent)
-        above = {path.resolve() for path in (here, *here.parents)}
-        folders[:] = [name for name in folders if (here / name).resolve() not in above]
+        links = [name for name in folders if (here / name).is_symlink()]
+        above = {path.resolve() for path in (here, *here.parents) if links}
+        for name in links:
+            if (here / name).resolve() in above:
+                folders.remove(name)
         yield from (here / name for name in names)
 
 
@@ -350,14 +353,15 @@ def read_values(path: Path, dtype: str) -> NDArray[Any]:
 def read_text(
     path: Path, expected: str = "a file of the dataset", at_most: int | None = None
 ) -> str:
-    """Read the text of a file; the arguments are those of ``read_file``.
+    """Read the text of a file, without a byte-order mark; the arguments are those of
+    ``read_file``.
 
     Raises:
         FileError: if it cannot be read.
         DataError: if it is not UTF-8 text, or too long.
     """
     try:
-        return read_file(path, expected, at_most).decode()
+        return read_file(path, expected, at_most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(
             f"{path} is not a text file ({error.reason})", "UTF-8 text"
@@ -424,22 +428,6 @@ def write_named_matrices(
         for name, m in matrices.items()
     ]
     write_file(path, "".join(lines).encode())
-
-
-def png_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) of a PNG, from its header; None if the file is missing or its header
-    damaged."""
-    try:
-        with open_file(path) as file:
-            header = file.read(24)
-    except OSError:
-        return None
-    if len(header) < 24 or header[:8] != b"\x89PNG\r\n\x1a\n":
-        return None
-    width, height = np.frombuffer(header[16:], ">u4").tolist()
-    if 1 <= min(width, height) <= max(width, height) <= LARGEST_IMAGE:
-        return (width, height)
-    return None
 
 
 def numbers(values: Iterable[float]) -> str:

@@ -14,6 +14,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from io import BytesIO
 from math import prod
 from pathlib import Path
@@ -24,7 +25,7 @@ import yaml
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files.disk import SKIP_HINT, STRAY, read_file, read_text
+from lidar_synth.files.disk import SKIP_HINT, STRAY, open_file, read_file, read_text
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -359,6 +360,20 @@ def _array(
         if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes < 0xE000))).any():
             raise DataError(f"{where} holds invalid text", ARRAYS, SKIP_HINT)
     return values.reshape(shape, order="F" if fortran else "C")
+
+
+def picture_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) of a PNG or JPEG, from its header; None if the file is missing or its header
+    damaged."""
+    from PIL import Image
+
+    with (
+        suppress(*DAMAGED_ZIP, Image.DecompressionBombError),
+        open_file(path) as file,
+        Image.open(file, formats=PICTURES) as opened,
+    ):
+        return opened.size
+    return None
 
 
 def read_picture(path: Path, expected: str = "a PNG or JPEG file") -> "Image":

@@ -71,13 +71,13 @@ READERS: dict[str, type[ScanFiles]] = {
     "pandaset": PandaSet,
     "kitti_raw": KITTIRaw,
     "bank": BankScans,
-    "webdataset": WebDataset,
     "mcap": MCAP,
     "py123d": Py123D,
     "cosmos": Cosmos,
     "png": RangePNG,
     "range": RangeImages,
     "folder": Folder,
+    "webdataset": WebDataset,
 }
 """{layout: reader}, in the order in which readers are asked whether they recognise a path."""
 
@@ -116,8 +116,8 @@ def open_scans(
         layout: one of ``READERS``; by default it is recognised from the files.
         split: name of a split, if the layout has splits.
         fields: floats per point of plain ``.bin`` files.
-        reflectance_max: maximum of the reflectance in plain files and MCAP, such as 255; values are
-            divided by it.
+        reflectance_max: maximum of the reflectance in plain files, MCAP and KITTI's layouts with
+            labels, such as 255; values are divided by it.
         on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` skips it, with a
             warning; ``"drop-points"`` drops points that are NaN or infinite, and counts them.
 

@@ -5,13 +5,19 @@ from copy import copy
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from lidar_synth.errors import DataError
-from lidar_synth.formats.calibration import in_view
+from lidar_synth.formats.calibration import Calibration, in_view, read_image_size
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan
 
 IMAGE_SIZE = (1242, 375)
 """(width, height) of KITTI's images in pixels, taken where no file tells it."""
+
+FAR = 0.1
+"""Share of KITTI's image size by which that of another camera differs; KITTI's principal points
+tell its own within 8 %."""
 
 
 class CameraBoxes(ScanFiles):
@@ -49,7 +55,7 @@ class CameraBoxes(ScanFiles):
     @property
     def options(self) -> dict[str, Any]:
         """See ``ScanFiles.options``."""
-        return {"cropped": True} if self._cropped else {}
+        return super().options | ({"cropped": True} if self._cropped else {})
 
     @abstractmethod
     def _has_boxes(self, name: str) -> bool:
@@ -65,6 +71,17 @@ class CameraBoxes(ScanFiles):
                 f"scan {scan.id} of {self.root} without calibration",
                 "the dataset's calib files, which tell what camera 2 sees",
             )
-        return in_view(
-            scan, replace(camera, image_size=camera.image_size or IMAGE_SIZE)
-        )
+        return in_view(scan, replace(camera, image_size=assumed_size(camera)))
+
+
+def assumed_size(camera: Calibration) -> tuple[int, int]:
+    """(width, height) of a camera's image in pixels. Where no file tells it, KITTI's if that has
+    the principal point near its centre, or else the size that has it in the centre.
+
+    Raises:
+        DataError: if no image has it in the centre.
+    """
+    centred = np.rint(2 * camera.projection[:2, 2])
+    if camera.image_size or np.allclose(centred, IMAGE_SIZE, rtol=FAR):
+        return camera.image_size or IMAGE_SIZE
+    return read_image_size(centred, "the principal point of P2")

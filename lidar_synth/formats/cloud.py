@@ -6,10 +6,10 @@ a scan keep their names. ``raw_label`` is stored bit for bit as a signed integer
 PLY reader supports unsigned 32-bit values.
 
 The logs of drivers have other names and types, which are read too: ``ring`` or ``channel`` of any
-integers, the time as ``time`` (float32 seconds), ``t`` or ``time_stamp`` (nanoseconds) or
-``timestamp``, and Ouster's ``reflectivity``, which is calibrated and takes precedence over its
-``intensity``, the number of photons. Names of the reflectance may have capitals, and CloudCompare's
-prefix ``scalar_``.
+integers, the time as ``time``, ``t``, ``time_stamp`` or ``timestamp`` in any unit of ``UNITS``, and
+Ouster's ``reflectivity``, which is calibrated and takes precedence over its ``intensity``, the
+number of photons. Names of the reflectance may have capitals, and CloudCompare's prefix
+``scalar_``.
 """
 
 import io
@@ -47,15 +47,21 @@ IN_MEMORY = {
 
 REFLECTANCES = ("reflectivity", "intensity", "reflectance", "remission", "i")
 RINGS = ("ring", "channel")
-TIMES = ("t", "time_stamp", "timestamp")
+TIMES = ("time", "t", "time_stamp", "timestamp")
 """Names of a field in the files of drivers and other programs, of which the first one counts."""
 
+UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+"""Units of times in seconds."""
+
 LONGEST_TURN = 1.05
-"""Seconds from the first to the last point of a scan, by which the unit of float times is
-recognised."""
+"""Seconds from the first to the last point of a scan, by which the unit of times is recognised."""
 
 WANTED = ("x", "y", "z", *STORED, "channel", *TIMES)
 """The fields that are read from a file beside its reflectance; all others are ignored."""
+
+LONGEST_PADDING = 1 << 16
+"""Maximum number of zeros after the points: earlier versions of PCL write one page of memory more
+than the points take, whatever the length of the header."""
 
 WIDEST = 1 << 20
 """Maximum number of bytes of one point."""
@@ -104,12 +110,16 @@ def size_error(where: str, held: int, wanted: int, unit: str = "bytes") -> DataE
 def check_size(body: bytes, size: int, where: str, *, more: bool = False) -> None:
     """Refuse a body whose length does not match the header.
 
-    A final line break is allowed, and with ``more`` any further bytes.
+    A final line break is allowed, up to ``LONGEST_PADDING`` zeros, and with ``more`` any further
+    bytes.
 
     Raises:
         DataError: if it is too short or too long.
     """
-    if len(body) < size or not (more or body[size:] in (b"", b"\n", b"\r\n")):
+    tail = body[size:]
+    if len(tail) <= LONGEST_PADDING:
+        tail = tail.rstrip(b"\0")
+    if len(body) < size or not (more or tail in (b"", b"\n", b"\r\n")):
         raise size_error(where, len(body), size)
 
 
@@ -237,7 +247,7 @@ def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     ):
         arrays["ring"] = ring.astype(np.int16)
     if time is not None and "time" not in arrays:
-        arrays |= _seconds(time)
+        arrays |= seconds(time)
     return arrays
 
 
@@ -248,17 +258,15 @@ def _first(
     return next((stored[name] for name in names if name in stored), None)
 
 
-def _seconds(time: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """``time`` as seconds from the first point: nanoseconds if whole, otherwise in the unit in
-    which a turn is short.
+def seconds(time: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """``time`` as seconds from the first point, read in the largest unit in which a turn is short.
 
     Nothing if there is no such unit, or all points have one time: that is the time of the file.
     """
     if not np.isfinite(time).all() or time.min() == time.max():
         return {}
     since = (time - time.min()).astype(np.float64)
-    units = (1e-9,) if time.dtype.kind in "iu" else (1.0, 1e-3, 1e-6, 1e-9)
-    unit = next((unit for unit in units if since.max() * unit <= LONGEST_TURN), None)
+    unit = next((unit for unit in UNITS if since.max() * unit <= LONGEST_TURN), None)
     return {} if unit is None else {"time": (since * unit).astype(np.float32)}
 
 

@@ -258,7 +258,8 @@ def _current(path: Path) -> Description:
         raise DataError(
             f"{path} is damaged ({error})",
             expected,
-            "Restore it; or remove it and name the sensor: --sensor (sensor=...).",
+            "Restore it; or remove it (rename it, if it is another program's) and name the "
+            "sensor: --sensor (sensor=...).",
         ) from error
 
 

@@ -27,7 +27,7 @@ from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import files_below, read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_arrays
-from lidar_synth.formats.cloud import REFLECTANCES
+from lidar_synth.formats.cloud import REFLECTANCES, seconds
 from lidar_synth.formats.description import Description
 from lidar_synth.formats.npz import (
     check_numbers,
@@ -38,7 +38,7 @@ from lidar_synth.formats.npz import (
 from lidar_synth.formats.pcd import read_pcd, read_pcd_description, write_pcd
 from lidar_synth.formats.ply import read_ply, read_ply_description, write_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
-from lidar_synth.formats.points import check_scan, read_points
+from lidar_synth.formats.points import check_scale, check_scan, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import DETAILS, LABELS, FileWriter
 from lidar_synth.geometry.assign import assign_beams
@@ -100,7 +100,7 @@ class Folder(ScanFiles):
     ) -> None:
         if fields < 4:
             raise ConfigError(f"fields={fields}", "at least 4")
-        check_scale(reflectance_max)
+        self._reflectance_max = check_scale(reflectance_max)
         root = Path(root)
         base, self._paths = scan_paths(root, SUFFIXES)
         ids = [
@@ -110,7 +110,6 @@ class Folder(ScanFiles):
             root, ids, sensor, on_bad, stored=_named_sensor(self._paths[0])
         )
         self._fields = fields
-        self._reflectance_max = reflectance_max
 
     @property
     def options(self) -> dict[str, Any]:
@@ -123,41 +122,28 @@ class Folder(ScanFiles):
 
     def _decode(self, path: Path) -> Scan:
         suffix = path.suffix.lower()
-        scale = self._reflectance_max or 1.0
+        most = self._reflectance_max
         if suffix == ".bin":
-            points = read_points(path, self._fields, scale)
+            points = read_points(path, self._fields, most)
             beside = path.with_suffix(".label")
             labels = (
                 read_labels(beside, path, len(points), SEMANTIC_KITTI)
                 if beside.is_file()
                 else {}
             )
-            scan = Scan(points[:, :3], points[:, 3], self.sensor, **labels)
-        elif suffix == ".npz":
+            return Scan(points[:, :3], points[:, 3], self.sensor, **labels)
+        if suffix == ".npz":
             stored = read_arrays(path)
             known = self.sensor if self._unknown else self._named
             own = "sensor" in stored
             scan = decode_scan(stored, str(path), self._given if own else known)
-            check_scan(scan, str(path), scale)
-        else:
-            arrays = ARRAYS[suffix](path)
-            said = _description(path)
-            sensor = self._given or (said and said.sensor) or self.sensor
-            most = self._reflectance_max
-            return as_scan(arrays, said, sensor, path, most, not self._unknown)
-        if scale != 1:
-            scan.reflectance = scan.reflectance / np.float32(scale)
-        return scan
-
-
-def check_scale(reflectance_max: float | None) -> None:
-    """Refuse a maximum of the reflectance that there cannot be.
-
-    Raises:
-        ConfigError: on one that is not above 0 and finite.
-    """
-    if not (reflectance_max is None or 0 < reflectance_max < np.inf):
-        raise ConfigError(f"reflectance_max={reflectance_max}", "above 0")
+            check_scan(scan, str(path), most or 1.0)
+            scan.reflectance = scan.reflectance / np.float32(most or 1)
+            return scan
+        arrays = ARRAYS[suffix](path)
+        said = _description(path)
+        sensor = self._given or (said and said.sensor) or self.sensor
+        return as_scan(arrays, said, sensor, path, most, not self._unknown)
 
 
 def as_scan(
@@ -192,6 +178,8 @@ def as_scan(
         arrays["reflectance"] = np.zeros(len(arrays["points"]), np.float32)
     if said is None:
         arrays = {name: a for name, a in arrays.items() if name not in _OURS}
+        if "time" in arrays:
+            arrays |= seconds(arrays.pop("time"))
     scan = Scan(sensor=sensor, **arrays)
     scan = drop_empty_firings(scan) if said is None else said.origin.apply(scan)
     scan.boxes = read_boxes(path)

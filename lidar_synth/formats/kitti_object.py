@@ -6,7 +6,7 @@ Layout (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme):
     training/velodyne_reduced/           the same, only points in the view of camera 2
     training/label_2/FFFFFF.txt          one object per line, rectified camera frame
     training/calib/FFFFFF.txt            P0..P3, R0_rect, Tr_velo_to_cam, Tr_imu_to_velo
-    training/image_2/FFFFFF.png          left colour camera
+    training/image_2/FFFFFF.png          left colour camera; also read as .jpg
     testing/                             the same without label_2
     ImageSets/train.txt, val.txt ...     frame numbers of each split
     mapping/train_mapping.txt, train_rand.txt    the drive of each frame, from the devkit
@@ -23,16 +23,16 @@ from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import (
     list_files,
     name_errors,
-    png_size,
     read_named_matrices,
     read_text,
     write_file,
     write_named_matrices,
 )
+from lidar_synth.files.parsing import picture_size
 from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
-from lidar_synth.formats.camera_boxes import IMAGE_SIZE, CameraBoxes
+from lidar_synth.formats.camera_boxes import IMAGE_SIZE, CameraBoxes, assumed_size
 from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
-from lidar_synth.formats.points import read_points
+from lidar_synth.formats.points import check_scale, read_points
 from lidar_synth.formats.source import OnBad
 from lidar_synth.formats.writer import Picture, Writer, write_image
 from lidar_synth.geometry.scan import Scan
@@ -66,11 +66,13 @@ class KITTIObject(CameraBoxes):
         reduced: read ``velodyne_reduced``, the points in the view of camera 2.
         sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says
             (``scans.json``), or else ``hdl64e_kitti``.
+        reflectance_max: maximum of the reflectance in the files, by default 1; values are divided
+            by it.
         on_bad: see ``ScanFiles``.
 
     Raises:
         ConfigError: on a split that KITTI does not have, or ``train`` or ``val`` without
-            ``ImageSets``.
+            ``ImageSets``; on an invalid ``reflectance_max``.
         DataError: if the folder has none of the split's scans.
 
     Example:
@@ -97,8 +99,10 @@ class KITTIObject(CameraBoxes):
         *,
         reduced: bool = False,
         sensor: str | Path | Sensor | None = None,
+        reflectance_max: float | None = None,
         on_bad: OnBad = "error",
     ) -> None:
+        self._reflectance_max = check_scale(reflectance_max)
         root = Path(root)
         self._velodyne = "velodyne_reduced" if reduced else "velodyne"
         parts = choose("KITTI object split", split, SPLITS)
@@ -157,11 +161,18 @@ class KITTIObject(CameraBoxes):
         part, frame = name.split("/")
         return self.root / part / folder / f"{frame}{suffix}"
 
+    def _image(self, name: str) -> Path:
+        png = self._file(name, "image_2", ".png")
+        return png if png.is_file() else png.with_suffix(".jpg")
+
     def read(self, index: int) -> Scan:
         name = self.ids[index]
-        points = read_points(self._file(name, self._velodyne, ".bin"))
+        points = read_points(
+            self._file(name, self._velodyne, ".bin"),
+            reflectance_max=self._reflectance_max,
+        )
         labels = self._file(name, "label_2", ".txt")
-        image = self._file(name, "image_2", ".png")
+        image = self._image(name)
         boxes = None
         if labels.is_file():
             boxes = read_label_2(
@@ -186,7 +197,7 @@ class KITTIObject(CameraBoxes):
         path = self._file(name, "calib", ".txt")
         if not path.is_file():
             return None
-        return read_calibration(path, png_size(self._file(name, "image_2", ".png")))
+        return read_calibration(path, picture_size(self._image(name)))
 
 
 class KITTIObjectWriter(Writer):
@@ -244,13 +255,13 @@ class KITTIObjectWriter(Writer):
             )
         camera = camera or OBJECT_CAMERA
         if picture is None:
-            width, height = camera.image_size or IMAGE_SIZE
+            width, height = assumed_size(camera)
             picture = np.zeros((height, width, 3), np.uint8)
         image = folder / "image_2" / f"{frame}.png"
         write_image(image, picture)
         write_calibration(folder / "calib" / f"{frame}.txt", camera)
         if camera.image_size is None:  # on which depends which boxes are in view
-            camera = replace(camera, image_size=png_size(image))
+            camera = replace(camera, image_size=picture_size(image))
         if folder.name == "training" and scan.boxes is not None:
             write_label_2(folder / "label_2" / f"{frame}.txt", scan.boxes, camera)
         self._write_points(path, scan)

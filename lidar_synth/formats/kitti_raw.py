@@ -22,10 +22,10 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import (
     list_files,
     name_errors,
-    png_size,
     read_file,
     read_named_matrices,
 )
+from lidar_synth.files.parsing import picture_size
 from lidar_synth.formats.calibration import Calibration, homogeneous, read_image_size
 from lidar_synth.formats.camera_boxes import CameraBoxes
 from lidar_synth.formats.points import read_points
@@ -136,7 +136,7 @@ class KITTIRaw(CameraBoxes):
         drive = self._drives[name]
         return read_calibration(
             drive.resolve().parent,
-            png_size(drive / "image_02" / "data" / f"{frame}.png"),
+            picture_size(drive / "image_02" / "data" / f"{frame}.png"),
         )
 
 

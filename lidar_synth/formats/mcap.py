@@ -20,13 +20,8 @@ from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthE
 from lidar_synth.files.disk import open_file, write_file
 from lidar_synth.formats.cloud import Field, check_fields, to_arrays, to_records
 from lidar_synth.formats.description import Description, from_comments, to_comments
-from lidar_synth.formats.folder import (
-    as_scan,
-    check_scale,
-    has_files,
-    scan_paths,
-    write_boxes,
-)
+from lidar_synth.formats.folder import as_scan, has_files, scan_paths, write_boxes
+from lidar_synth.formats.points import check_scale
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import FileWriter
 from lidar_synth.geometry.scan import POINT_FIELDS, Scan
@@ -107,8 +102,7 @@ class MCAP(ScanFiles):
         reflectance_max: float | None = None,
         on_bad: OnBad = "error",
     ) -> None:
-        check_scale(reflectance_max)
-        self._reflectance_max = reflectance_max
+        self._reflectance_max = check_scale(reflectance_max)
         root = Path(root)
         base, paths = scan_paths(root, (SUFFIX,))
         self._places: list[MessagePlace] = []
@@ -265,7 +259,7 @@ def _points(message: Any, where: str) -> dict[str, NDArray[Any]]:
     """The arrays of a message, named as in ``Scan``.
 
     Raises:
-        DataError: on fields or sizes that do not fit together.
+        DataError: on fields or sizes that do not fit together, or without any point.
     """
     count = message.width * message.height
     order = ">" if message.is_bigendian else "<"
@@ -297,6 +291,7 @@ def _points(message: Any, where: str) -> dict[str, NDArray[Any]]:
     points = np.frombuffer(rows.tobytes(), np.dtype(layout))
     if not message.is_dense:  # drivers mark firings without return so
         points = points[np.isfinite([points[axis] for axis in "xyz"]).all(0)]
+        check_fields(fields, len(points), where)
     return to_arrays({name: points[name] for name in names})
 
 

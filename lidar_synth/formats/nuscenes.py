@@ -109,7 +109,7 @@ class NuScenes(ScanFiles):
             )
         scan = Scan(
             ahead(points[:, :3]),
-            points[:, 3] / np.float32(INTENSITY_MAX),
+            points[:, 3],
             self.sensor,
             ring=(RINGS - 1 - rings).astype(np.int16),
             id=self.ids[index],

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
-from lidar_synth.errors import DataError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import SKIP_HINT, refuse_special, unreadable, write_file
 from lidar_synth.formats.calibration import check_rigid
 from lidar_synth.geometry.scan import FARTHEST, Scan
@@ -26,7 +26,7 @@ _bad_points_kept = ContextVar("bad points kept", default=False)
 
 
 def read_points(
-    path: Path, fields: int = 4, reflectance_max: float = 1.0
+    path: Path, fields: int = 4, reflectance_max: float | None = None
 ) -> NDArray[np.float32]:
     """Read the points of a raw ``.bin`` file: little-endian float32, ``fields`` per point, no
     header.
@@ -34,10 +34,10 @@ def read_points(
     Args:
         path: the file.
         fields: floats per point; the first three are x, y, z in metres, the fourth is reflectance.
-        reflectance_max: maximum of the fourth field; the minimum is 0.
+        reflectance_max: maximum of the fourth field, by default 1; the minimum is 0.
 
     Returns:
-        (N, fields) float32, checked by ``check_points``.
+        (N, fields) float32, checked by ``check_points``; the fourth divided by its maximum.
 
     Raises:
         FileError: if the file cannot be read.
@@ -68,8 +68,20 @@ def read_points(
             f"{hint}It may be truncated. {SKIP_HINT}",
         )
     points = values.reshape(-1, fields)
-    check_points(points, points[:, 3], str(path), reflectance_max)
+    check_points(points, points[:, 3], str(path), reflectance_max or 1.0)
+    points[:, 3] /= np.float32(reflectance_max or 1)
     return points
+
+
+def check_scale(reflectance_max: float | None) -> float | None:
+    """The maximum of the reflectance, if there can be such a one.
+
+    Raises:
+        ConfigError: on one that is not above 0 and finite.
+    """
+    if not (reflectance_max is None or 0 < reflectance_max < np.inf):
+        raise ConfigError(f"reflectance_max={reflectance_max}", "above 0")
+    return reflectance_max
 
 
 def write_points(path: Path, scan: Scan) -> None:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError, choose
 from lidar_synth.files.disk import files_below
 from lidar_synth.files.parsing import read_arrays
+from lidar_synth.formats.folder import SUFFIXES as OF_POINTS
 from lidar_synth.formats.folder import scan_paths
 from lidar_synth.formats.npz import (
     check_numbers,
@@ -81,13 +82,14 @@ class RangeImages(ScanFiles):
 
     @classmethod
     def recognises(cls, root: Path) -> bool:
-        """Whether the first array file is an image and not a list of points."""
+        """Whether the first array file is an image and not a list of points, and no other file
+        holds points."""
         paths = (
             [root]
             if root.is_file()
-            else sorted(p for p in files_below(root) if p.suffix in SUFFIXES)
+            else sorted(p for p in files_below(root) if p.suffix in OF_POINTS)
         )
-        if not paths or paths[0].suffix not in SUFFIXES:
+        if not paths or not {path.suffix for path in paths} <= set(SUFFIXES):
             return False
         try:
             arrays = read_arrays(paths[0])

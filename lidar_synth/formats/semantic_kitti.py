@@ -24,7 +24,6 @@ from lidar_synth.files.disk import (
     list_files,
     name_errors,
     numbers,
-    png_size,
     read_file,
     read_matrix,
     read_named_matrices,
@@ -32,6 +31,7 @@ from lidar_synth.files.disk import (
     write_file,
     write_named_matrices,
 )
+from lidar_synth.files.parsing import picture_size
 from lidar_synth.formats.calibration import (
     Calibration,
     check_rigid,
@@ -39,7 +39,7 @@ from lidar_synth.formats.calibration import (
     ideal_camera,
 )
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
-from lidar_synth.formats.points import read_points
+from lidar_synth.formats.points import check_scale, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import (
     LABELS,
@@ -83,10 +83,13 @@ class SemanticKITTI(ScanFiles):
             (``scans.json``), or else ``hdl64e_semantic_kitti``.
         taxonomy: the class ids of the labels, for datasets in this layout with classes of their
             own.
+        reflectance_max: maximum of the reflectance in the files, by default 1; values are divided
+            by it.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        ConfigError: on a split that SemanticKITTI does not have.
+        ConfigError: on a split that SemanticKITTI does not have, or an invalid
+            ``reflectance_max``.
         DataError: if the folder has none of the split's sequences.
 
     Example:
@@ -116,8 +119,10 @@ class SemanticKITTI(ScanFiles):
         *,
         sensor: str | Path | Sensor | None = None,
         taxonomy: Taxonomy = SEMANTIC_KITTI,
+        reflectance_max: float | None = None,
         on_bad: OnBad = "error",
     ) -> None:
+        self._reflectance_max = check_scale(reflectance_max)
         root = Path(root)
         self.taxonomy = taxonomy
         self.folders = folders = _find_sequences(root, split)
@@ -135,7 +140,7 @@ class SemanticKITTI(ScanFiles):
         sequence, frame = self.ids[index].split("/")
         folder = self.folders[sequence]
         path = folder / "velodyne" / f"{frame}.bin"
-        points = read_points(path)
+        points = read_points(path, reflectance_max=self._reflectance_max)
         labels = {}
         if sequence in self._labelled:
             labels = read_labels(
@@ -292,7 +297,9 @@ def read_calibration(folder: Path) -> Calibration | None:
     matrices = read_named_matrices(folder / "calib.txt")
     if any(matrices.get(name, np.zeros(0)).size != 12 for name in ("P2", "Tr")):
         return None
-    size = next((png_size(p) for p in sorted((folder / "image_2").glob("*.png"))), None)
+    size = next(
+        (picture_size(p) for p in sorted((folder / "image_2").glob("*.png"))), None
+    )
     with name_errors(folder / "calib.txt"):
         return Calibration(
             matrices["P2"].reshape(3, 4), homogeneous(matrices["Tr"]), size, matrices

@@ -62,6 +62,7 @@ class ScanFiles(ABC):
 
     default_sensor: ClassVar[str] = "hdl64e_kitti"
     plain: ClassVar[bool] = False
+    _reflectance_max: float | None = None
 
     @classmethod
     def recognises(cls, root: Path) -> bool:
@@ -109,7 +110,8 @@ class ScanFiles(ABC):
     @property
     def options(self) -> dict[str, Any]:
         """Further options of the reader that determine its scans, as plain values."""
-        return {}
+        scale = self._reflectance_max
+        return {} if scale is None else {"reflectance_max": scale}
 
     @abstractmethod
     def read(self, index: int) -> Scan:
