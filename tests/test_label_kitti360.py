@@ -41,7 +41,7 @@ from lidar_synth.lab.kitti360.accumulated import (
 from lidar_synth.lab.kitti360.labels import label_scans, plan_labels
 from lidar_synth.lab.kitti360.report import LabelReport
 from lidar_synth.lab.town import Town, export_town
-from lidar_synth.lab.town.accumulate import MOST, STEP, windows_of
+from lidar_synth.lab.town.accumulate import STEP, windows_of
 
 DRIVE = "2013_05_28_drive_0004_sync"
 SCANS = 20
@@ -493,13 +493,15 @@ def test_clouds_hold_every_second_frame_within_reach(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("layout", "scans"), [("semantic_kitti", 5), ("kitti360", MOST + 1)]
+    ("layout", "scans", "interval"),
+    [("semantic_kitti", 5, 0.4), ("kitti360", 2001, 0.4), ("kitti360", 2000, 4.0)],
 )
 def test_what_cannot_be_accumulated_is_refused(
-    layout: str, scans: int, tmp_path: Path
+    layout: str, scans: int, interval: float, tmp_path: Path
 ) -> None:
+    town = Town(0, scans=scans, interval=interval)
     with pytest.raises(ConfigError, match="accumulated"):
-        export_town(Town(0, scans=scans), tmp_path, layout, accumulate=True)
+        export_town(town, tmp_path, layout, accumulate=True)
 
 
 def test_the_command_prints_a_report(

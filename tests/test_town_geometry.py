@@ -24,7 +24,7 @@ from lidar_synth.lab.town.meshes import (
     merge,
     tube,
 )
-from lidar_synth.lab.town.movers import place_movers
+from lidar_synth.lab.town.movers import ego_place, place_movers
 from lidar_synth.lab.town.plants import (
     CORE,
     LEAF,
@@ -36,7 +36,8 @@ from lidar_synth.lab.town.plants import (
 from lidar_synth.lab.town.returns import ReturnNoise, cell_noise, laser_gains
 from lidar_synth.lab.town.solid import Solid
 from lidar_synth.lab.town.street import KINDS as STREETS
-from lidar_synth.lab.town.street import LEFT, RIGHT, SHARES, sample_street
+from lidar_synth.lab.town.street import LEFT, REACH, RIGHT, SHARES, sample_street
+from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.town.vehicles import vehicles
 from lidar_synth.lab.town.world import STRETCH_FRAMES, WORLD, build_world, rng_for
 
@@ -290,6 +291,19 @@ def test_sampled_streets_of_a_kind_vary_and_are_valid(kind: str) -> None:
                 c.sides == (RIGHT, LEFT) and 0 < c.s < street.length + 20
                 for c in street.crossings
             )
+
+
+@pytest.mark.parametrize("interval", [0.1, 0.4, 2.0, 4.0, 20.0])
+def test_no_scan_leaves_its_stretch_of_road(interval: float) -> None:
+    town = Town(interval=interval)
+    assert (town.apart == 1000) == (interval <= 2)
+    times = np.arange(STRETCH_FRAMES) * interval
+    for number in range(60):
+        kind = STREETS[number % len(STREETS)]
+        street = sample_street(kind, times[-1], np.random.default_rng(number))
+        beside = [abs(ego_place(street, time)[1]) for time in times]
+        assert max(beside) <= REACH
+        assert street.length + 2 * town.sensor.range_max < town.apart
 
 
 def test_all_kinds_of_street_are_sampled() -> None:

@@ -394,7 +394,10 @@ def test_sweeps_fill_gaps_and_moving_objects_follow_their_boxes() -> None:
     unknown = replace(
         later, boxes=replace(later.boxes, instance=np.array([9], np.int32))
     )
-    assert not (casting(HDL64E).cast(blind, sweeps=[unknown]).scan.label == CAR).any()
+    pose = later.pose.copy()
+    pose[0, 3] = 500  # so far away, its instances are other objects
+    for sweep in (unknown, replace(later, pose=pose)):
+        assert CAR not in casting(HDL64E).cast(blind, sweeps=[sweep]).scan.label
     with pytest.raises(DataError, match="without a pose; expected poses"):
         casting(HDL64E).cast(scan, sweeps=[replace(later, pose=None)])
 

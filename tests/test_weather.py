@@ -208,6 +208,15 @@ def test_extinction_of_precipitation() -> None:
     assert Rain(5).extinction < Rain(50).extinction
 
 
+@pytest.mark.parametrize("rate", [0.5, 1.0, 2.5])
+def test_snow_falls_at_a_metre_a_second(rate: float) -> None:
+    """The water in the air follows from the flakes, and the fall speed from it."""
+    melted = DIAMETERS / precipitation.FLAKE
+    step = DIAMETERS[1] - DIAMETERS[0]
+    water = (np.pi / 6 * melted**3 * Snow(rate).number()).sum() * step  # mm^3 / m^3
+    assert 0.8 < 1e6 * rate / water / 3600 < 1.3
+
+
 def test_the_extinction_efficiency_is_that_of_mie() -> None:
     """Against miepython 3.3.0 (efficiencies_mx at 905 nm), the mean over 5 % of the diameter."""
     diameter = np.array([0.05, 0.1, 0.2, 0.5, 1.0, 2.0])
@@ -257,11 +266,15 @@ def test_spray_lies_behind_vehicles() -> None:
     assert np.array_equal(bare.points, scan.points)
 
 
-def test_rays_through_a_box_against_points_along_them() -> None:
+@pytest.mark.parametrize(
+    "values", [[6, -4, 1, 9, 5, 4, 0.7], [2, 0, -0.1, 12, 3, 3.3, 0.1]]
+)
+def test_rays_through_a_box_against_points_along_them(values: list[float]) -> None:
+    """A box beside the sensor, and one around it."""
     rng = np.random.default_rng(3)
     points = np.float32(rng.uniform(-30, 30, (300, 3)))
     distance = np.linalg.norm(points, axis=1)
-    box = np.array([6, -4, 1, 9, 5, 4, 0.7], np.float32)
+    box = np.array(values, np.float32)
     first, last, rays = cover.cross_box(points, distance, box)
     along = np.linspace(0, 1, 4001)
     boxes = Boxes(box, ("Car",))
@@ -355,6 +368,12 @@ def test_a_box_without_returns_is_flagged() -> None:
     new = IncompleteEcho(1.0)(scan, keyed_rng(0))
     assert len(new) == 0 and new.boxes is not None
     assert new.boxes.occlusion.tolist() == [OUT_OF_SIGHT, -1]  # the second had none
+    drop = np.arange(20) == 7
+    cause = np.where(drop, SCATTERED, SURFACE).astype(np.uint8)
+    label = np.where(drop, IGNORE, scan.label).astype(np.uint8)
+    new = IncompleteEcho(1.0)(replace(scan, cause=cause, label=label), keyed_rng(0))
+    assert len(new) == 1 and new.boxes is not None
+    assert new.boxes.occlusion.tolist() == [OUT_OF_SIGHT, -1]  # a drop is no return
 
 
 def test_mixed_scans_take_them(clear: Scan) -> None:
@@ -403,6 +422,9 @@ def test_scans_that_lack_something(name: str, clear: Scan) -> None:
             corruption(bare, keyed_rng(0))
     else:
         assert len(corruption(bare, keyed_rng(0))) > 0
+    points = np.where(clear.points > 40, np.float32(np.nan), clear.points)
+    with pytest.raises(DataError, match="NaN or infinite.*isfinite"):
+        corruption(replace(clear, points=points), keyed_rng(0))
     if name in ("missing_beams", "cross_sensor"):
         wrong = replace(clear, ring=np.full(len(clear), 99, np.int16))
         with pytest.raises(LidarSynthError, match="rings from 99 to 99"):

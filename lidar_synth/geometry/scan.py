@@ -409,6 +409,21 @@ def identity_of(source: Any) -> str:
     return f"{type(source).__name__}:{len(source)}:{hashed}"
 
 
+def require_finite(scan: Scan) -> None:
+    """Check the points of a scan.
+
+    Raises:
+        DataError: if some are NaN or infinite.
+    """
+    if not np.isfinite(scan.points).all():
+        raise DataError(
+            f"scan {scan.id!r} with points that are NaN or infinite",
+            "finite points",
+            "Drop them: scan[np.isfinite(scan.points).all(1)], or on_bad='drop-points' where "
+            "scans are read.",
+        )
+
+
 def scan_hash(scan: Scan) -> str:
     """SHA-256 of the points of a scan, their fields and its sensor."""
     digest = hashlib.sha256(repr(scan.sensor).encode())

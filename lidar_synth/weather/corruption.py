@@ -18,7 +18,7 @@ from typing_extensions import Self
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.geometry.assign import assign_beams
-from lidar_synth.geometry.scan import CAUSES, Boxes, Scan
+from lidar_synth.geometry.scan import CAUSES, Boxes, Scan, require_finite
 
 Values = NDArray[np.float32]
 
@@ -88,7 +88,12 @@ class Corruption(ABC):
         """
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        """The corrupted scan; the given one is not changed."""
+        """The corrupted scan; the given one is not changed.
+
+        Raises:
+            DataError: on points that are NaN or infinite, or as ``change``.
+        """
+        require_finite(scan)
         settings = {f.name: getattr(self, f.name) for f in fields(self)[1:]}
         scan = scan.noted(self.name, **settings)
         if not len(scan):
@@ -104,7 +109,7 @@ class Corruption(ABC):
             if given is not None:
                 changed[name] = np.where(lost, given.dtype.type(value), given)
         if scan.boxes is not None:
-            changed["boxes"] = _flagged(scan.boxes, scan.points, change)
+            changed["boxes"] = _flagged(scan.boxes, scan, change)
         return replace(
             new, points=change.points, reflectance=change.reflectance, **changed
         )
@@ -145,10 +150,13 @@ def require_between(name: str, value: float, low: float, high: float) -> None:
         raise ConfigError(f"{name}={value}", f"{low:g} to {high:g}")
 
 
-def _flagged(boxes: Boxes, points: Values, change: Change) -> Boxes:
-    """The boxes, with those that have lost all their returns flagged."""
-    inside = boxes.contain(points)
-    left = np.zeros(len(points), bool)
+def _flagged(boxes: Boxes, scan: Scan, change: Change) -> Boxes:
+    """The boxes, with those that have lost all their returns flagged. What was no surface
+    before is no return of theirs."""
+    inside = boxes.contain(scan.points)
+    if scan.cause is not None:
+        inside &= scan.cause == SURFACE
+    left = np.zeros(len(scan), bool)
     left[change.source[change.cause == SURFACE]] = True
     gone = inside.any(1) & ~(inside & left).any(1)
     occlusion = np.where(gone, OUT_OF_SIGHT, boxes.occlusion).astype(np.int8)

@@ -29,8 +29,9 @@ CELL = 0.02
 
 @dataclass(frozen=True)
 class Spray(SignalLoss):
-    """Spray that the wheels of vehicles throw up from a wet road, behind every box of a
-    vehicle and behind the sensor's own.
+    """Spray that the wheels of vehicles throw up from a wet road, behind every box of
+    ``VEHICLES`` (``Car``, ``Van``, ``Truck``, ``Tram``) and behind the sensor's own vehicle.
+    Buses have none where their boxes are ``Misc``: in the town, PandaSet and KITTI-360.
 
     Args:
         extinction: of the plumes, 1 / m.
@@ -108,9 +109,10 @@ def cross_box(
     """
     centre = box[:3]
     half = box[3:6] / 2
-    # Rays farther from its centre than its corners do not meet it.
-    tangent = np.sqrt(max(float(centre @ centre - half @ half), 0))
-    rays = np.flatnonzero(points @ centre >= distance * np.float32(tangent))
+    # From outside of the sphere of its corners, rays beside that do not meet it.
+    outside = float(centre @ centre - half @ half)
+    tangent = np.float32(np.sqrt(max(outside, 0)))
+    rays = np.flatnonzero((points @ centre >= distance * tangent) | (outside < 0))
     c = np.cos(box[6])
     s = np.sin(box[6])
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)

@@ -3,7 +3,7 @@
 The numbers n(D) of particles of diameter D (mm) per m^3 and mm at r mm of water / h are ::
 
     rain  8000 exp(-4.1 r^-0.21 D)                          (Marshall and Palmer 1948)
-    snow  7600 r^-0.87 exp(-2.55 r^-0.48 D), D when melted  (Gunn and Marshall 1958)
+    snow  3800 r^-0.87 exp(-2.55 r^-0.48 D), D when melted  (Gunn and Marshall 1958)
 
 after Kilic et al. 2021 ("Lidar light scattering augmentation") and Hahner et al. 2022
 ("LiDAR snowfall simulation for robust 3D object detection"). Their extinction is ::
@@ -20,7 +20,9 @@ up to there are expected, in all the diameters together ::
 
     k(S) = (pi / 12) d^2 (q / (d^2 S))^(3/4) int D^(3/2) n(D) dD
 
-and the strongest one on a ray is that for which k is a standard exponential number.
+and the strongest one on a ray is that for which k is a standard exponential number. The
+receiver's view of the beam near the sensor (``signal.overlap``) is applied to that one after
+the draw, though it may make another one the strongest: the draw is exact without it.
 """
 
 from abc import abstractmethod
@@ -156,6 +158,6 @@ class Snow(Precipitation):
     reflectance = 0.9
 
     def number(self) -> NDArray[np.float64]:
-        density = 7600 * self.rate**-0.87 / FLAKE
+        density = 3800 * self.rate**-0.87 / FLAKE
         slope = 2.55 * self.rate**-0.48 / FLAKE
         return np.asarray(density * np.exp(-slope * DIAMETERS))

@@ -12,7 +12,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.projection.kernels import medians, sines_of
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds, turns
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import Scan, require_finite
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.kernels import (
     find_level,
@@ -206,12 +206,7 @@ def _check(scan: Scan) -> None:
             f"scan {scan.id!r} without a return",
             "a scan with returns, to find surfaces",
         )
-    if not np.isfinite(scan.points).all():
-        raise DataError(
-            f"scan {scan.id!r} with points that are NaN or infinite",
-            "finite points",
-            "on_bad='drop-points' drops them when scans are read.",
-        )
+    require_finite(scan)
 
 
 def _check_rings(

@@ -23,7 +23,8 @@ def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
     Returns in a box of the sweep move with the box to the one of the same ``instance`` in the scan.
     Returns of other
     vehicles and people are left out, because they may have moved: those in a box that the scan does
-    not have, and those labelled as movable in no box.
+    not have, and those labelled as movable in no box. All are left out if both sensors together do
+    not reach from one pose to the other: numbers of instances may mean other objects there.
 
     Args:
         sweep: N returns, with a pose.
@@ -45,6 +46,8 @@ def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
     assert scan.pose is not None and sweep.pose is not None
     change = np.linalg.inv(scan.pose) @ sweep.pose
     points = sweep.points.astype(np.float64)
+    if np.linalg.norm(change[:3, 3]) > sweep.sensor.range_max + scan.sensor.range_max:
+        return np.full_like(points, np.nan)
     out = points @ change[:3, :3].T + change[:3, 3]
     if sweep.label is not None:
         out[MOVABLE[sweep.label]] = np.nan

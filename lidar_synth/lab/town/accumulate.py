@@ -35,9 +35,9 @@ ANGLE = np.radians(0.03)
 """Standard deviations of the errors of the poses with which scans are accumulated, metres and
 radians."""
 
-MOST = 2000
-"""Maximum number of scans: farther from the origin, the layout's float32 would be coarser than
-``SPACING``."""
+MOST = 100_000.0
+"""Maximum distance of a stretch from the origin, metres: farther, the layout's float32 would be
+coarser than ``SPACING``."""
 
 NEAREST = 3.0
 """Minimum distance from which a point is accumulated, metres."""
@@ -50,12 +50,13 @@ def check_accumulation(town: Town, layout: str) -> None:
     """Refuse what cannot be accumulated.
 
     Raises:
-        ConfigError: on another layout than ``kitti360``, or more than ``MOST`` scans.
+        ConfigError: on another layout than ``kitti360``, or scans farther off than ``MOST``.
     """
-    if layout != "kitti360" or len(town) > MOST:
+    most = int(MOST / town.apart) * STRETCH_FRAMES
+    if layout != "kitti360" or len(town) > most:
         raise ConfigError(
             f"accumulated clouds of {len(town)} scans in layout {layout!r}",
-            f"layout 'kitti360', whose float32 coordinates are exact enough for {MOST} scans",
+            f"layout 'kitti360', whose float32 coordinates are exact enough for {most} scans",
             "Several towns (--seed) hold more.",
         )
 

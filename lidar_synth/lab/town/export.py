@@ -47,7 +47,7 @@ layout of the files is theirs, so that the same readers and trainers take them.
 
 - layout: {layout}; sensor: {sensor}; seed: {seed}; {interval} s between neighbouring scans
 - {frames} neighbouring scans share a stretch of road; instance numbers count within a stretch, and
-  stretches lie 1 km apart in the poses
+  stretches lie at least 1 km apart in the poses
 - `{settings}` holds the settings; `lidar-synth town` with the same settings resumes an interrupted
   run
 """

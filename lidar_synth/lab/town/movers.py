@@ -9,7 +9,7 @@ import numpy as np
 from lidar_synth.lab.town.meshes import Array, Ints
 from lidar_synth.lab.town.objects import Prototype
 from lidar_synth.lab.town.scene import PlacedObject, Pose, Scene
-from lidar_synth.lab.town.street import LEFT, RIGHT, Street
+from lidar_synth.lab.town.street import LEFT, REACH, RIGHT, Street
 
 
 class Line(NamedTuple):
@@ -92,7 +92,7 @@ def ego_place(street: Street, time: float) -> tuple[float, float, float]:
     the street.
 
     The vehicle follows its lane with a small lateral drift, or turns in an arc into the right lane
-    of a side street.
+    of a side street, where it stops ``REACH`` metres beside the street.
     """
     travelled = street.speed * time
     lane = street.lanes[0].t
@@ -105,7 +105,7 @@ def ego_place(street: Street, time: float) -> tuple[float, float, float]:
     beyond = max(0.0, travelled - begin - radius * np.pi / 2)
     s = min(travelled, begin) + radius * np.sin(angle)
     t = lane + side * (radius * (1 - np.cos(angle)) + beyond)
-    return float(s), float(t), side * angle
+    return float(s), float(np.clip(t, -REACH, REACH)), side * angle
 
 
 def ego_pose(

@@ -15,6 +15,8 @@ from lidar_synth.lab.town.catalogue import TABLES, Rng, pick, pick_name, sample_
 KINDS = tuple(TABLES["streets"])
 SHARES = tuple(row["share"] for row in TABLES["streets"].values())
 """Probability of each kind."""
+FASTEST = max(row["speed"][1] for row in TABLES["streets"].values())
+"""Maximum speed of the ego vehicle, m/s."""
 REACH = 88.0
 """Metres of detailed world in front of, behind and beside the ego vehicle: slightly more than the
 sensor's range."""

@@ -1,8 +1,8 @@
 """The town as a source of scans: ``Town(seed)[i]`` is the same scan in every process and in any
 order of access. Twenty neighbouring scans share a stretch of road. The ego vehicle drives along it,
 with ``interval`` seconds from scan to scan, among static and moving objects. Stretches lie a
-kilometre apart in the world frame of the poses, so that accumulating scans by pose never mixes two
-of them.
+kilometre apart in the world frame of the poses, or more at long intervals (``Town.apart``), so that
+accumulating scans by pose never mixes two of them.
 """
 
 from dataclasses import asdict
@@ -30,6 +30,7 @@ from lidar_synth.lab.town.returns import ReturnNoise, laser_gains, measure, see_
 from lidar_synth.lab.town.scene import PlacedObject, Pose
 from lidar_synth.lab.town.shading import render, sample_light
 from lidar_synth.lab.town.skin.skin import Skin, load_skin
+from lidar_synth.lab.town.street import FASTEST
 from lidar_synth.lab.town.world import (
     IMAGE,
     LIGHT,
@@ -43,7 +44,7 @@ from lidar_synth.lab.town.world import (
 REVOLUTION = 0.1
 """Seconds of one turn of the sensor."""
 APART = 1000.0
-"""Metres between the origins of two stretches in the world frame of the poses."""
+"""Minimum metres between the origins of two stretches in the world frame of the poses."""
 
 
 class Town:
@@ -61,6 +62,10 @@ class Town:
         skin: the look of a real sensor's returns, as ``load_skin`` takes it; by default the
             physical model's alone. Labels, rings and boxes are the same with it; a few returns are
             missing.
+
+    Attributes:
+        apart: metres between the origins of two stretches in the world frame of the poses: more
+            than the vehicle drives on one and sees at its ends.
 
     Raises:
         ConfigError: on a negative seed or number of scans, an interval out of range, an unknown
@@ -102,6 +107,8 @@ class Town:
             self.skin.check(self.sensor)
         # A skin has the offsets of the real lasers.
         self._noise = noise or (ReturnNoise(gain_std=0) if self.skin else ReturnNoise())
+        driven = STRETCH_FRAMES * interval * FASTEST
+        self.apart = max(APART, driven + 2 * self.sensor.range_max)
         self._scans = scans
         self._motion = motion
         self._worlds: dict[int, World] = {}
@@ -241,7 +248,7 @@ class Town:
             if o.prototype.name and o.instance in returned
         ]
         placed = pose.copy()
-        placed[0, 3] += APART * (index // STRETCH_FRAMES)
+        placed[0, 3] += self.apart * (index // STRETCH_FRAMES)
         return Scan(
             points=points,
             reflectance=reflectance,
