@@ -31,7 +31,7 @@ LIMITS = {
     "docs/how-to/your-sensor.md": 400,
     "docs/how-to/your-dataset.md": 330,
     "docs/how-to/pandaset.md": 190,
-    "docs/how-to/label-kitti360.md": 130,
+    "docs/how-to/label-kitti360.md": 135,
     "docs/how-to/another-sensor.md": 180,
     "docs/how-to/skin.md": 170,
     "docs/how-to/measure.md": 340,

@@ -28,6 +28,7 @@ from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, KITTIRaw, open_s
 from lidar_synth.formats.calibration import Calibration, ideal_camera, in_view
 from lidar_synth.formats.camera_boxes import assumed_size
 from lidar_synth.formats.convert import convert
+from lidar_synth.formats.kitti360 import scans_folder
 from lidar_synth.formats.point_labels import decode_labels, encode_labels
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.lab.proof.detection.study import with_boxes
@@ -479,11 +480,30 @@ def test_static_kitti360_boxes_are_listed_near_their_window(tmp_path: Path) -> N
     )
     assert boxes.at(600, np.eye(4), 80).instance.tolist() == [26007, 24007]
     assert boxes.at(700 + MARGIN, np.eye(4), 80).names == ("Car",)
-    assert (
-        len(boxes.at(701 + MARGIN, np.eye(4), 80))
-        == len(boxes.at(600, a_pose(), 80))
-        == 0
-    )
+    assert len(boxes.at(600, a_pose(), 80)) == 0  # none is near
+    assert boxes.at(701 + MARGIN, np.eye(4), 80) is None  # not known
+
+
+def test_boxes_of_kitti360_are_known_where_the_car_stands_still_and_in_windows_alone(
+    tmp_path: Path,
+) -> None:
+    scans = [replace(some_scan(i, count=40), pose=a_pose(0)) for i in range(4)]
+    scans[1].boxes = None  # a frame without an object is written like this
+    write_all("kitti360", tmp_path, scans, calibration=some_camera())
+    poses = tmp_path / "data_poses" / "2013_05_28_drive_0000_sync" / "poses.txt"
+    first, *left_out, last = poses.read_text().splitlines(True)
+    assert len(left_out) == 2
+    poses.write_text(first + "1000" + last.removeprefix("3"))
+    files = scans_folder(tmp_path, poses.parent.name)
+    (files / "0000000003.bin").rename(files / "0000001000.bin")
+    *near, far = KITTI360(tmp_path)
+    np.testing.assert_allclose([scan.pose for scan in near], [scans[0].pose] * 3)
+    assert [scan.boxes is not None and len(scan.boxes) for scan in near] == [
+        len(scans[0].boxes),  # type: ignore[arg-type]
+        0,
+        len(scans[2].boxes),  # type: ignore[arg-type]
+    ]
+    assert far.pose is not None and far.boxes is None
 
 
 def test_positions_of_kitti_tracklets_are_centres_of_the_floor(tmp_path: Path) -> None:

@@ -55,6 +55,7 @@ def _moving_box(
         np.array(["Car"] * len(frames)),
         np.full(len(frames), instance, np.int32),
         windows,
+        windows,
     )
 
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lidar_synth import KITTI360, MixedScans
+from lidar_synth import KITTI360, MixedScans, open_scans
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.formats.kitti360 import (
+    LABELLED,
     boxes_path,
     confidence_path,
     label_file,
@@ -30,6 +31,7 @@ from lidar_synth.formats.kitti360_poses import (
     read_poses,
     undo_ego_motion,
 )
+from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.kitti360 import labels as kitti360_labels
 from lidar_synth.lab.kitti360.accumulated import (
@@ -135,6 +137,32 @@ def test_a_segmenter_gets_only_scans_with_labels(
     assert MixedScans(scans, ratio=0)[0]["label"].max() < 256
     with pytest.raises(DataError, match="lidar-synth label kitti360"):
         KITTI360(root, labels=root / "calibration")
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_the_path_of_labels_opens_the_labelled_scans(
+    in_place: bool, copy: Path, labelled: tuple[Path, LabelReport]
+) -> None:
+    out = copy if in_place else copy.parent / "labels"
+    shutil.copytree(labelled[0] / LABELLED, out / LABELLED)
+    if in_place:  # as another program leaves them
+        (out / LABELLED / "report.json").unlink()
+    (labels_folder(out, DRIVE) / f"{5:010d}.label").unlink()
+    names = [f"{DRIVE}/{i:010d}" for i in range(SCANS) if i != 5]
+    for path in (out / LABELLED,) if in_place else (out / LABELLED, out):
+        scans = open_scans(path, split="r2flow/train")
+        assert list(scans.ids) == names and scans[0].confidence is not None
+        assert open_scans(scans.root).ids == scans.ids and scans[0].pose is not None
+    assert len(open_scans(copy)) == SCANS
+    with pytest.raises(ConfigError, match="open the folder that lidar-synth label"):
+        project(open_scans(copy)[5], channels=["label"])
+
+
+def test_labels_of_a_dataset_that_has_moved_say_so(tmp_path: Path) -> None:
+    (tmp_path / LABELLED).mkdir()
+    (tmp_path / LABELLED / "report.json").write_text('{"root": "elsewhere"}')
+    with pytest.raises(DataError, match="elsewhere has no drive.*has moved"):
+        open_scans(tmp_path)
 
 
 @pytest.mark.slow
@@ -529,6 +557,7 @@ def test_the_command_prints_a_report(
     stored = json.loads(
         (tmp_path / "data_3d_semantics_scan" / "report.json").read_text()
     )
+    assert stored.pop("root") == str(root.resolve())
     assert (
         report == stored
         and report["shares"]["right"] > 0.97

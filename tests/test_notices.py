@@ -4,12 +4,13 @@ import logging
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from mixtures import SENSOR, Endless, Scans, as_is
 from streets import kitti, street
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Subset
 
 from lidar_synth import mix
 from lidar_synth.formats import WRITERS, KITTIObject, open_scans
@@ -109,6 +110,20 @@ def test_unlabelled_real_scans_of_a_detector_are_not(
     real = [replace(street(i), label=None, instance=None) for i in range(4)]
     train = mix(real, [street(9), street(8)], 0.5, task="detection", epochs=8)
     assert not logged(train, caplog)
+
+
+def test_real_scans_whose_boxes_are_not_known_are_for_a_detector(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    real = [street(i) for i in range(4)]
+    real[1] = replace(real[1], boxes=None)
+    options: dict[str, Any] = {"epoch_size": 8, "augment": None}
+    assert not logged(MixedScans(real, [street(9)], 0.25, **options), caplog)
+    [message] = logged(MixedScans(real, [street(9)], 0.25, "boxes", **options), caplog)
+    assert repr(real[1].id) in message and "Subset(scans" in message
+    known = Subset(real, [i for i, scan in enumerate(real) if scan.boxes is not None])
+    caplog.clear()
+    assert not logged(MixedScans(known, [street(9)], 0.25, "boxes", **options), caplog)
 
 
 def test_points_outside_of_the_view_that_has_boxes_are(

@@ -21,12 +21,14 @@ point, KITTI-360's semantic id, -1 = none found. Under data_3d_semantics_scan, t
 both and distinguishes the two encodings by their size: two bytes per point are the encoding of that
 tool, four are SemanticKITTI's packing (KITTI-360's semantic id in the lower 16 bits, instance
 above), which the writer uses. Only frames of annotated windows can have labels; all others are read
-without labels.
+without labels, unless the path that is opened is that of the labels: ``data_3d_semantics_scan``, or
+the folder that the command wrote, whose ``report.json`` names the dataset's root.
 
 The pose of a ``Scan`` is velodyne to world: pose calib_cam_to_pose[image_00] calib_cam_to_velo^-1.
 """
 
 import re
+from collections.abc import Set
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +40,9 @@ from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.datasets.recordings import KITTI360_SPLITS
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import list_files, read_file, read_values
+from lidar_synth.files.parsing import read_facts
 from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.description import NAME
 from lidar_synth.formats.kitti360_boxes import (
     MOST_INSTANCE,
     WorldBoxes,
@@ -47,6 +51,7 @@ from lidar_synth.formats.kitti360_boxes import (
 )
 from lidar_synth.formats.kitti360_poses import (
     CAMERA,
+    fill_poses,
     read_calibration,
     read_poses,
     write_calibration,
@@ -76,19 +81,24 @@ SPLITS = KITTI360_SPLITS
 """Drives of each split, named after the work that introduced it; None = all existing drives. The
 splits overlap: LiDM trains on drives on which R2Flow tests."""
 
+LABELLED = "data_3d_semantics_scan"
+"""The folder of labels per scan."""
+
 
 class KITTI360(ScanFiles):
     """KITTI-360's drives: <root>/data_3d_raw/DRIVE/velodyne_points/data/*.bin with poses, boxes,
     calibration, images.
 
-    A scan has labels if its label file exists, and boxes if the drive has boxes and the scan a
-    pose.
+    A scan has labels if its label file exists, and boxes if it has a pose and lies in a window of
+    the drive that was annotated with boxes. The dataset leaves out poses where the car hardly
+    moved; they are filled (``fill_poses``).
 
     Args:
-        root: the folder that holds ``data_3d_raw``.
+        root: the folder that holds ``data_3d_raw``; or that of labels, ``data_3d_semantics_scan``
+            or what ``lidar-synth label kitti360`` wrote, for the labelled scans alone.
         split: the full name of a split, such as ``r2flow/train``, or ``all``.
         labels: the folder with ``data_3d_semantics_scan``; then only scans that have labels there
-            are read. By default all scans are read, with labels where ``root`` has them.
+            are read, as if ``root`` were that of labels.
         sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says
             (``scans.json``), or else ``hdl64e_kitti360``.
         on_bad: see ``ScanFiles``.
@@ -114,7 +124,7 @@ class KITTI360(ScanFiles):
     @classmethod
     def recognises(cls, root: Path) -> bool:
         """See ``ScanFiles.recognises``."""
-        return (root / "data_3d_raw").is_dir()
+        return folders_of(root)[1] is not None or (root / "data_3d_raw").is_dir()
 
     def __init__(
         self,
@@ -125,34 +135,40 @@ class KITTI360(ScanFiles):
         sensor: str | Path | Sensor | None = None,
         on_bad: OnBad = "error",
     ) -> None:
-        root = Path(root)
-        drives = drives_of(root, split)
+        home, found = folders_of(Path(root))
+        labels = found if labels is None else labels
+        drives = drives_of(home, split)
         ids = [
             f"{d}/{path.stem}"
             for d in drives
-            for path in list_files(scans_folder(root, d), ".bin")
+            for path in list_files(scans_folder(home, d), ".bin")
         ]
-        self._labels = root if labels is None else Path(labels)
+        self._labels = home if labels is None else Path(labels)
         if labels is not None:
             ids = [name for name in ids if label_file(self._labels, *name.split("/"))]
             if not ids:
                 raise DataError(
-                    f"{labels} has no labels of scans of {root}",
+                    f"{labels} has no labels of scans of {home}",
                     "data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label",
-                    f"lidar-synth label kitti360 {root} {labels} makes them from the accumulated "
+                    f"lidar-synth label kitti360 {home} {labels} makes them from the accumulated "
                     "clouds.",
                 )
-        super().__init__(root, ids, sensor, on_bad)
-        self._camera = read_calibration(root)
-        self._poses = {d: read_poses(root, d, self._camera) for d in drives}
+        super().__init__(home, ids, sensor, on_bad)
+        self.root = Path(root)  # by which others open the same scans
+        self._home = home
+        self._camera = read_calibration(home)
+        self._poses = {
+            d: fill_poses(read_poses(home, d, self._camera), frames_of(home, d))
+            for d in drives
+        }
         self._boxes: dict[str, WorldBoxes | None] = {}
 
     def read(self, index: int) -> Scan:
         drive, frame = self.ids[index].split("/")
-        path = scans_folder(self.root, drive) / f"{frame}.bin"
+        path = scans_folder(self._home, drive) / f"{frame}.bin"
         points = read_points(path)
         pose = self._poses[drive].get(int(frame)) if frame.isdecimal() else None
-        image = image_path(self.root, drive, frame)
+        image = image_path(self._home, drive, frame)
         return Scan(
             points[:, :3],
             points[:, 3],
@@ -166,6 +182,19 @@ class KITTI360(ScanFiles):
             id=self.ids[index],
         )
 
+    def files_for(self, fields: Set[str]) -> list[Path]:
+        """See ``ScanFiles.files_for``: nothing of other drives, except for layouts, which are made
+        of everything."""
+        root = self._home
+        found = [root if "layout" in fields else root / NAME]
+        for drive in sorted({name.partition("/")[0] for name in self.ids}):
+            found.append(scans_folder(root, drive))
+            if fields & {"label", "semantic", "layout"}:
+                found.append(labels_folder(self._labels, drive))
+            if "camera" in fields:
+                found.append(image_path(root, drive, "").parent)
+        return found
+
     def calibration(self, index: int) -> Calibration | None:
         return self._camera
 
@@ -173,7 +202,7 @@ class KITTI360(ScanFiles):
         self, drive: str, frame: int, pose: NDArray[np.float64]
     ) -> Boxes | None:
         if drive not in self._boxes:
-            path = boxes_path(self.root, drive)
+            path = boxes_path(self._home, drive)
             self._boxes[drive] = None if path is None else read_boxes(path)
         boxes = self._boxes[drive]
         return None if boxes is None else boxes.at(frame, pose, self.sensor.range_max)
@@ -309,9 +338,32 @@ def _facts(scan: Scan) -> dict[str, Any]:
     }
 
 
+def folders_of(path: Path) -> tuple[Path, Path | None]:
+    """The dataset's root, and the folder with ``data_3d_semantics_scan`` if ``path`` is one of
+    labels, whose scans alone are meant.
+
+    Raises:
+        FileError, DataError: if the report of the labels cannot be read.
+    """
+    labels = path.parent if path.name == LABELLED else path
+    if (labels / "data_3d_raw").is_dir():
+        return labels, None if labels == path else labels
+    report = labels / LABELLED / "report.json"
+    if not report.is_file():
+        return path, None
+    facts = read_facts(report, "the report of lidar-synth label kitti360")
+    return Path(str(facts.get("root", path))), labels
+
+
 def scans_folder(root: Path, drive: str) -> Path:
     """The folder of a drive's scans."""
     return root / "data_3d_raw" / drive / "velodyne_points" / "data"
+
+
+def frames_of(root: Path, drive: str) -> list[int]:
+    """The frames of a drive's scans."""
+    names = (path.stem for path in list_files(scans_folder(root, drive), ".bin"))
+    return [int(name) for name in names if name.isdecimal()]
 
 
 def image_path(root: Path, drive: str, frame: str) -> Path:
@@ -340,6 +392,7 @@ def drives_of(root: Path, split: str) -> list[str]:
             f"{root} has no drive of split {split!r} (it has "
             f"{', '.join(existing) or 'none at all'})",
             "data_3d_raw/2013_05_28_drive_NNNN_sync/velodyne_points/data/*.bin",
+            "If the dataset of a folder of labels has moved, run lidar-synth label kitti360 again.",
         )
     return drives
 
@@ -351,12 +404,12 @@ def boxes_path(root: Path, drive: str) -> Path | None:
 
 def labels_folder(root: Path, drive: str) -> Path:
     """The folder of a drive's labels per scan."""
-    return root / "data_3d_semantics_scan" / drive / "labels"
+    return root / LABELLED / drive / "labels"
 
 
 def confidence_path(root: Path, drive: str, frame: str) -> Path:
     """The file with the confidence of a scan's labels."""
-    return root / "data_3d_semantics_scan" / drive / "confidence" / f"{frame}.bin"
+    return root / LABELLED / drive / "confidence" / f"{frame}.bin"
 
 
 def label_file(root: Path, drive: str, frame: str) -> Path | None:

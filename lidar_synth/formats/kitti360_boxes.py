@@ -9,8 +9,9 @@ not contain the frames in which it is visible.
 
 The reader therefore lists a static object in every frame whose sensor is within range of it, if its
 window is at most ``MARGIN`` frames away. Cars of the next window thus appear before it begins, and
-cars that parked at the same place at another time do not appear. ``Boxes`` has no tilt, so a box
-that is tilted relative to the sensor keeps only its yaw.
+cars that parked at the same place at another time do not appear. Farther from all windows, boxes
+are not known. ``Boxes`` has no tilt, so a box that is tilted relative to the sensor keeps only its
+yaw.
 
 ``semanticId`` is not the id of the label images, but an older numbering (``OBJECTS``); drive 0004
 has labels only.
@@ -93,23 +94,29 @@ class WorldBoxes:
         instances: (M,) int32.
         windows: (M, 2) int64 first and last frame in which an object may be listed; the same for a
             moving object.
+        annotated: (K, 2) int64 first and last frame in which the static objects of a window may be
+            listed, whatever their class.
     """
 
     transforms: NDArray[np.float64]
     names: NDArray[np.str_]
     instances: NDArray[np.int32]
     windows: NDArray[np.int64]
+    annotated: NDArray[np.int64]
 
-    def at(self, frame: int, pose: NDArray[np.float64], range_max: float) -> Boxes:
-        """The boxes around one scan, in its sensor frame.
+    def at(
+        self, frame: int, pose: NDArray[np.float64], range_max: float
+    ) -> Boxes | None:
+        """The boxes around one scan, in its sensor frame; None if no window covers the frame.
 
         Args:
             frame: number of the frame.
             pose: (4, 4) sensor to world.
             range_max: maximum distance of an object's centre, metres.
         """
-        now = (self.windows[:, 0] <= frame) & (frame <= self.windows[:, 1])
-        now &= (
+        if not _cover(self.annotated, frame).any():
+            return None
+        now = _cover(self.windows, frame) & (
             np.linalg.norm(self.transforms[:, :3, 3] - pose[:3, 3], axis=1) <= range_max
         )
         local = np.linalg.inv(pose) @ self.transforms[now]
@@ -120,6 +127,10 @@ class WorldBoxes:
             tuple(self.names[now].tolist()),
             instance=self.instances[now],
         )
+
+
+def _cover(spans: NDArray[np.int64], frame: int) -> NDArray[np.bool_]:
+    return (spans[:, 0] <= frame) & (frame <= spans[:, 1])
 
 
 def read_boxes(path: Path) -> WorldBoxes:
@@ -133,6 +144,7 @@ def read_boxes(path: Path) -> WorldBoxes:
     names = []
     instances = []
     windows = []
+    annotated = set()
     try:
         for _, node in ElementTree.iterparse(path):
             if node.find("transform") is None:
@@ -141,6 +153,12 @@ def read_boxes(path: Path) -> WorldBoxes:
                 node.findtext("semanticId")
                 or BY_LABEL.get(node.findtext("label", ""), -1)
             )
+            frame, first, last = (
+                int(node.findtext(t) or -1)
+                for t in ("timestamp", "start_frame", "end_frame")
+            )
+            span = (first - MARGIN, last + MARGIN)
+            annotated.add(span)
             if semantic in OBJECTS:
                 _, image_id, name = OBJECTS[semantic]
                 transforms.append(
@@ -151,19 +169,14 @@ def read_boxes(path: Path) -> WorldBoxes:
                 instances.append(
                     image_id * MAX_INSTANCES + int(node.findtext("instanceId") or 0)
                 )
-                frame, first, last = (
-                    int(node.findtext(t) or -1)
-                    for t in ("timestamp", "start_frame", "end_frame")
-                )
-                windows.append(
-                    (frame, frame) if frame >= 0 else (first - MARGIN, last + MARGIN)
-                )
+                windows.append((frame, frame) if frame >= 0 else span)
             node.clear()
         found = WorldBoxes(
             np.array(transforms).reshape(-1, 4, 4),
             np.array(names, np.str_),
             np.array(instances, np.int32),
             np.array(windows, np.int64).reshape(-1, 2),
+            np.array(sorted(annotated), np.int64).reshape(-1, 2),
         )
     except OSError as error:
         raise unreadable(path, error) from error

@@ -3,7 +3,7 @@ of bad scans."""
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
@@ -179,6 +179,14 @@ class ScanFiles(ABC):
                 raise ConfigError(given, "points of that sensor", _NAME_IT)
             warnings.warn(f"{given}. {_NAME_IT}", stacklevel=4)
         self._unchecked = False
+
+    def files_for(self, fields: Set[str]) -> list[Path]:
+        """The files and folders that fields of the scans come from; some may be missing.
+
+        Args:
+            fields: range, reflectance, label, or kinds of conditions (``CONDITIONS``).
+        """
+        return [self.root]
 
     def calibration(self, index: int) -> Calibration | None:
         """The camera calibration of scan ``index``; None if the dataset has none."""

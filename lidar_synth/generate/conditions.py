@@ -33,7 +33,7 @@ from lidar_synth.files.parsing import read_picture
 from lidar_synth.geometry.layout import CHANNELS, CODES, Layout, layout_image, layout_of
 from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import LABELLED_ONLY, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -134,7 +134,9 @@ class SemanticMap(Condition):
         """
         if scan.label is None:
             raise DataError(
-                f"scan {scan.id!r} has no labels", "a labelled scan, to condition on"
+                f"scan {scan.id!r} has no labels",
+                "a labelled scan, to condition on",
+                LABELLED_ONLY,
             )
         labels = project(scan, sensor, ["label"]).channels["label"]
         return labels if options.get("keep_gaps") else bridge_gaps(labels)

@@ -25,6 +25,12 @@ CAUSES = "surface", "scattered", "crosstalk"
 """Why a return is where it is, by ``Scan.cause``: the surface that the ray met, particles in
 the air, or another pulse."""
 
+LABELLED_ONLY = (
+    "Leave out scans without labels; of KITTI-360, open the folder that lidar-synth label kitti360 "
+    "wrote (data_3d_semantics_scan), which has the labelled ones only."
+)
+"""What to do where all scans need labels."""
+
 FARTHEST = 1e5
 """Maximum coordinate, and size of a box, metres; no LiDAR measures farther."""
 

@@ -1,7 +1,7 @@
 """Messages about what would harm a training without an error; each is logged once per dataset.
 
-Objects without boxes, unlabelled real scans, reflectances or numbers of points that tell real from
-synthetic, a bank used very often.
+Objects without boxes, real scans without boxes or labels, reflectances or numbers of points that
+tell real from synthetic, a bank used very often.
 """
 
 import logging
@@ -52,6 +52,7 @@ class Notices:
         self._real_boxes = self._told = self._scale_told = False
         # a real scan without labels; "" if that is no matter, or told
         self._unlabelled: str | None = "" if boxes else None
+        self._wants_boxes = boxes
         self._labelled = False  # whether a synthetic scan had labels
         self._images = images
         # points of real and of synthetic scans
@@ -69,6 +70,15 @@ class Notices:
                 scan.reflectance.max(),
             )
         self._real_boxes |= scan.boxes is not None
+        if self._wants_boxes and scan.boxes is None:
+            self._wants_boxes = False
+            self._warn(
+                "the boxes of real scan %r are not known (scan.boxes is None): a detector would "
+                "learn that its objects are background. Leave such scans out: "
+                "torch.utils.data.Subset(scans, [i for i, scan in enumerate(scans) if scan.boxes "
+                "is not None]).",
+                scan.id,
+            )
         if self._unlabelled is None and (
             scan.label is None or not (scan.label != IGNORE).any()
         ):

@@ -24,7 +24,12 @@ from lidar_synth.geometry.projection.kernels import (
     pick_returns,
     returns_in,
 )
-from lidar_synth.geometry.scan import POINT_FIELDS, RangeImage, Scan
+from lidar_synth.geometry.scan import (
+    LABELLED_ONLY,
+    POINT_FIELDS,
+    RangeImage,
+    Scan,
+)
 from lidar_synth.geometry.sensor import Rays, Sensor
 
 
@@ -155,7 +160,9 @@ def carry(
     names = list(fields) if channels is None else list(channels)
     if missing := [n for n in names if n not in fields]:
         raise ConfigError(
-            f"scan {scan.id!r} has no {missing}", f"some of {sorted(fields)}"
+            f"scan {scan.id!r} has no {missing}",
+            f"some of {sorted(fields)}",
+            LABELLED_ONLY if "label" in missing else "",
         )
     carried = {}
     for name in names:

@@ -1,6 +1,6 @@
 """Labels per scan for KITTI-360, from its accumulated clouds; in parallel, resumable.
 
-Output, which ``KITTI360(root, labels=out)`` reads::
+Output, which ``KITTI360(out)`` reads::
 
     data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label    uint32 per point: KITTI-360's id,
                                                             instance above; 0 = none
@@ -8,7 +8,8 @@ Output, which ``KITTI360(root, labels=out)`` reads::
                                                             confidence of the label
     data_3d_semantics_scan/DRIVE/windows/WINDOW.json        counts of a complete window, and what it
                                                             was made of
-    data_3d_semantics_scan/report.json                      counts of all windows
+    data_3d_semantics_scan/report.json                      the dataset's root, and counts of all
+                                                            windows
 
 The unit of work is a window. A rerun repeats windows without a record, and those whose clouds,
 poses or boxes changed. A frame gets labels if a window covers it, it has a pose (or the car hardly
@@ -29,19 +30,15 @@ from tqdm import tqdm
 
 from lidar_synth.datasets.classes import KITTI360 as CLASSES
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.disk import (
-    list_files,
-    read_text,
-    remove_file,
-    sha256,
-    write_file,
-)
+from lidar_synth.files.disk import read_text, remove_file, sha256, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats.kitti360 import (
+    LABELLED,
     boxes_path,
     confidence_path,
     drives_of,
+    frames_of,
     labels_folder,
     read_scan_labels,
     scans_folder,
@@ -127,11 +124,7 @@ def plan_labels(root: str | Path, split: str = "all") -> Plan:
         if not windows:
             without_clouds.append(drive)
             continue
-        frames = [
-            int(p.stem)
-            for p in list_files(scans_folder(root, drive), ".bin")
-            if p.stem.isdecimal()
-        ]
+        frames = frames_of(root, drive)
         poses = _poses(root, drive)
         if not poses:
             raise DataError(
@@ -215,8 +208,8 @@ def label_scans(
             report.add(job.drive, record)
             bar.update(len(job.frames))
     write_file(
-        out / "data_3d_semantics_scan" / "report.json",
-        json.dumps(report.to_dict(), indent=1).encode(),
+        out / LABELLED / "report.json",
+        json.dumps({"root": str(root.resolve())} | report.to_dict(), indent=1).encode(),
     )
     report.check()
     return report

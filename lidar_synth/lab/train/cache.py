@@ -1,7 +1,7 @@
 """Training data on disk: scans kept as compact range images, projected once, with checksums."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -138,7 +138,7 @@ def cache_scans(
     if others:
         facts["others"] = {name: other.facts for name, other in others.items()}
     if folder is not None and (
-        files := _hash_of_files(source, folder, images=bool(others))
+        files := _hash_of_files(source, folder, {*names, *others})
     ):
         facts[FILES] = files
 
@@ -150,17 +150,19 @@ def cache_scans(
     )
 
 
-def _hash_of_files(source: Any, cache: Path, images: bool) -> str | None:
-    """A hash of the ids of a source, and of the names, sizes and modification times of the files at
-    its root, or at those of several; None for scans that are no files, such as the town's.
+def _hash_of_files(source: Any, cache: Path, fields: Set[str]) -> str | None:
+    """A hash of the ids of a source, and of the names, sizes and modification times of the files of
+    these fields, or of several sources; None for scans that are no files, such as the town's.
 
-    Camera images count only where ``images`` says so: a dataset may get them later.
+    Camera images count only where ``fields`` has a condition: a dataset may get them later.
     """
     told: list[str] = []
     for part in getattr(source, "datasets", [source]):
         if isinstance(part, ScanFiles):
-            skipped = () if images or isinstance(part, RangePNG) else CAMERA_SUFFIXES
-            told += [*part.ids, *_tell_files(part.root, cache, skipped)]
+            plain = fields <= DTYPES.keys() and not isinstance(part, RangePNG)
+            told += part.ids
+            for place in part.files_for(fields):
+                told += _tell_files(place, cache, CAMERA_SUFFIXES if plain else ())
     return hash_of_names(told) if told else None
 
 
