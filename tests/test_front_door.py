@@ -5,6 +5,8 @@ import importlib
 import json
 import re
 import runpy
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ from typer.testing import CliRunner
 import lidar_synth
 from lidar_synth.bank import Bank
 from lidar_synth.cli import app
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.recipes import folder, published, read_recipe
 from lidar_synth.lab.start.look import look
 from lidar_synth.lab.start.trainers import DEFAULTS, TRAINERS, configure, write_files
@@ -51,6 +53,26 @@ def test_what_lies_in_a_folder_of_each_layout(layout: str, tmp_path: Path) -> No
     found = look(tmp_path / "scans", None, tmp_path / "sensor.yaml", {})
     assert (found.layout, found.task, found.fit) == (layout, TASKS[layout], None)
     assert found.lines()[0].startswith(f"scans    3 of layout {layout}")
+
+
+def test_scans_of_which_some_have_labels_are_those_of_the_training_split(
+    tmp_path: Path,
+) -> None:
+    MAKERS["semantic_kitti"](tmp_path / "scans")
+    sequences = tmp_path / "scans" / "sequences"
+    [labelled] = sequences.iterdir()
+    shutil.copytree(labelled, sequences / "11", ignore=shutil.ignore_patterns("labels"))
+    given = {"scans": 1, "minutes": 0, "jobs": 1, "trainer": "lightning"}
+    made = lidar_synth.start(tmp_path / "scans", tmp_path / "out", **given)
+    assert made is not None
+    assert "3 of layout semantic_kitti, split train, in one" in made.found[0]
+    assert "in 3 of 3 scans" in made.found[1] and "split='train'" in made.code
+    assert "split='train'" in made.files[tmp_path / "out" / "train.py"]
+    labelled.rename(sequences / "30")  # of no split
+    found = look(tmp_path / "scans", None, tmp_path / "none.yaml", {})
+    assert (found.labelled, found.looked, found.task) == (3, 6, "unlabelled")
+    with pytest.raises(ConfigError, match="labels, which 3 of 6 scans looked at have"):
+        lidar_synth.start(tmp_path / "scans", tmp_path / "new", task="segmentation")
 
 
 @pytest.fixture(scope="module")
@@ -156,10 +178,13 @@ def test_labelled_scans_are_compared_and_mixed(tmp_path: Path) -> None:
 
 def test_scans_with_boxes_get_the_town_with_boxes(tmp_path: Path) -> None:
     MAKERS["kitti_object"](tmp_path / "scans")
-    made = lidar_synth.start(
-        tmp_path / "scans", tmp_path / "out", scans=1, minutes=0, jobs=1
-    )
+    given = {"scans": 1, "minutes": 0, "jobs": 1, "trainer": "lightning"}
+    made = lidar_synth.start(tmp_path / "scans", tmp_path / "out", **given)
     assert made is not None and "your objects pasted" in made.found[4]
+    script = made.files[tmp_path / "out" / "train.py"].partition("data = ")[0]
+    assert ".with_boxes(), settings" in script and 'task="detection"' in script
+    with pytest.raises(DataError, match="no box with 5 points"):
+        exec(script, {})  # the random boxes hold no objects that could be pasted
     assert 'task="detection"' in made.code and ".with_boxes()" in made.code
     assert "in unknown drives" in made.found[0] and "for 30 of 40" in made.found[4]
     town = lidar_synth.open_scans(tmp_path / "out" / "town")
@@ -213,6 +238,24 @@ def test_a_trainers_files_name_what_exists(trainer: str, task: str) -> None:
                 assert all(hasattr(home, alias.name) for alias in node.names)
     assert any("/data/MY_ROOT" in text for text in files.values())
     assert any("/data/HERE_TOO/mix.yaml" in text for text in files.values())
+
+
+@pytest.mark.parametrize(
+    ("trainer", "task"), [p for p in PAIRS if "train.sh" in TRAINERS[p[0]][p[1]]]
+)
+def test_scripts_are_of_any_folder(trainer: str, task: str, tmp_path: Path) -> None:
+    here = tmp_path / "my start"
+    here.mkdir()
+    files = configure(trainer, task, DEFAULTS[task], "/data/my scans", str(here))
+    show = """{ printf '%s\\n' "$LIDAR_SYNTH_MIX" "$@"; }"""
+    script = f"python() {show}\nsed() {show}\n{files['train.sh']}"
+    said = subprocess.run(
+        ["bash", "-ec", script], stdout=subprocess.PIPE, text=True, check=True
+    ).stdout
+    words = [said, *(path.read_text() for path in here.iterdir())]
+    lines = "\n".join(words).splitlines()
+    assert f"{here}/mix.yaml" in lines
+    assert any("/data/my scans" in line for line in lines)
 
 
 def test_the_lists_of_mmdetection3d_are_written(tmp_path: Path) -> None:

@@ -207,6 +207,7 @@ def test_a_trainer_of_ones_own_is_measured(tmp_path: Path) -> None:
         and base["miou"] < 50
         and result.values["trainer"] == "perfect"
     )
+    assert "turned and mirrored" not in (tmp_path / "index.html").read_text()
     low, high = exchange["interval"]
     assert low <= exchange["difference"] <= high and low > 0
 

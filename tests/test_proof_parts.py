@@ -28,7 +28,7 @@ from lidar_synth.errors import (
 from lidar_synth.geometry.projection import project
 from lidar_synth.lab.evaluate.segmentation import class_ious
 from lidar_synth.lab.evaluate.segmenter import CircularConv, _Wrapped
-from lidar_synth.lab.proof import ARMS, CommandTrainer, ProofSettings
+from lidar_synth.lab.proof import ARMS, CommandTrainer, ProofSettings, planning
 from lidar_synth.lab.proof.arms import Row, options_of, policy_of, rows
 from lidar_synth.lab.proof.budget import estimate_minutes, within
 from lidar_synth.lab.proof.command import describe
@@ -101,6 +101,11 @@ def test_auto_takes_drives_and_else_poses() -> None:
     assert find_places(SOURCES["pose"]) == find_places(SOURCES["pose"], "pose")
 
 
+def test_drives_of_nuscenes_are_its_logs() -> None:
+    names = [f"n{log}-2018__LIDAR_TOP__{i}" for log in ("008", "015") for i in (1, 2)]
+    assert find_places(Scans(names)) == {"n008-2018": [0, 1], "n015-2018": [2, 3]}
+
+
 def test_places_of_shuffled_frames_are_their_drives(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -137,14 +142,15 @@ def test_labelled_scans_come_from_many_places_and_not_from_the_one_left_out(
 def test_an_arm_trains_for_its_iterations_with_its_shares(
     name: str, tmp_path: Path
 ) -> None:
-    task = job(
-        name, tmp_path, iterations=21, ratio=0.5 if ARMS[name].ratio is None else None
-    )
+    ratio = 0.5 if ARMS[name].ratio is None else None
+    task = job(name, tmp_path, 21, ratio)
+    for few in range(10, 21):
+        counts = [count for _, count in replace(task, iterations=few).stages()]
+        assert min(counts) > 0 and sum(counts) == few
     mixtures = list(task.mixtures(collate="range"))
-    stages = task.row.stages()
     assert sum(count for _, count in mixtures) == task.iterations
-    assert sum(stage.share for stage in stages) == pytest.approx(1)
-    for stage, (mixed, count) in zip(stages, mixtures, strict=True):
+    assert sum(stage.share for stage in task.row.stages()) == pytest.approx(1)
+    for (stage, _), (mixed, count) in zip(task.stages(), mixtures, strict=True):
         domains = [mixed.domain(i) for i in range(len(mixed))]
         assert len(domains) == count * task.batch
         assert abs(sum(domains) - stage.ratio * len(domains)) < 1
@@ -331,6 +337,25 @@ def test_a_plan_is_paired_and_tests_on_places_left_out() -> None:
     assert all(scan.sensor.columns == 64 for scan in scans.values())
 
 
+def test_drives_without_labels_are_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    source = drives(3, 4)
+    source[8:] = [replace(scan, label=None, raw_label=None) for scan in source[8:]]
+    plan, _ = make_plan(source, SMALL, None, 1)
+    assert list(plan.places) == ["00", "01"] and "without labels: 02" in caplog.text
+    plan, _ = make_plan(source, SMALL, None, 1, tests=drives(1, 2, first=20))
+    assert max(i for part in plan.labelled.values() for i in part) < 8
+
+
+def test_scans_of_other_pairs_are_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning, "measure_step", lambda *given: (False, 60.0))
+    source = drives(6, 4)
+    settings = replace(SMALL, labelled=2)
+    plan, scans = make_plan(source, settings, 21 * 1.3 * 3, 1)
+    assert len(plan.pairs) < plan.wanted and len(scans) < len(source)
+    needed = {i for p in plan.pairs for i in (*plan.labelled[p], *plan.tested[p[0]])}
+    assert scans.keys() == needed
+
+
 def test_a_plan_says_how_many_labelled_scans_each_training_gets() -> None:
     names = [f"00/{frame:06d}" for frame in range(6)]
     source = Scans([*names, "01/000000", "02/000000"])
@@ -349,6 +374,9 @@ def test_scans_of_other_places_are_tested_by_one_training_for_each_seed() -> Non
     assert plan.tested == {"00": [5, 6], "01": [7, 8], "02": [9, 10]}
     assert scans[7].id == tests[2].id and plan.skin_scans("00") == list(range(5))
     assert "all tested places" in describe_plan(plan)
+    for minutes, seeds in ((0.11, 1), (0.5, 2)):
+        short = within(replace(plan, step=0.2), minutes)
+        assert short.pairs == plan.pairs[: 3 * seeds] and short.minutes <= minutes
 
 
 def test_tests_that_are_trained_on_or_of_another_sensor_are_refused() -> None:
@@ -394,6 +422,11 @@ def scans_with(**changes: object) -> Scans:
 
 BAD = {
     "one place": (Scans([f"00/{i}" for i in range(6)]), {}, "6 scans of one place"),
+    "too few for stretches": (
+        Scans(["00/0", "00/1"]),
+        {"places": "stretch"},
+        "2 scans of drives that are too short to cut.*Add scans",
+    ),
     "one cluster of poses": (
         Scans([f"00/{i}" for i in range(4)], [0, 1, 2, 3]),
         {},

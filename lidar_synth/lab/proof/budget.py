@@ -33,7 +33,7 @@ def estimate_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
     seconds *= OVERHEAD
     town = settings.synthetic * TOWN_SECONDS
     if "skin" in pools:
-        for place in {place for place, _ in pairs}:
+        for place in {served[0][0] for served in plan.trainings(pairs)}:
             scans = len(plan.skin_scans(place))
             seconds += town + scans * SKIN_SECONDS + 2 * SKIN_STREETS * TOWN_SECONDS
     seconds += town * len(pools & {"town", "learnt"})
@@ -43,7 +43,8 @@ def estimate_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
 
 
 def within(plan: ProofPlan, minutes: float | None, resumed: bool = False) -> ProofPlan:
-    """The plan with as many pairs as fit into the time, or with two pairs of fewer iterations.
+    """The plan with as many pairs as fit into the time, or with two pairs of fewer iterations. The
+    pairs of one training stay together.
 
     Args:
         plan: of all pairs.
@@ -54,10 +55,11 @@ def within(plan: ProofPlan, minutes: float | None, resumed: bool = False) -> Pro
         ConfigError: if two pairs do not fit even with ten iterations.
     """
     count = len(plan.pairs)
+    together = 1 if plan.training is None else len(plan.places)
     if minutes is not None:
         while count > 0 and estimate_minutes(plan, plan.pairs[:count]) > minutes:
-            count -= 1
-        least = min(2, len(plan.pairs))
+            count -= together
+        least = min(max(2, together), len(plan.pairs))
         if count < least and not resumed:
             plan = _with_fewer_iterations(plan, least, minutes)
         count = max(count, least)

@@ -84,7 +84,7 @@ def what_was_done(values: Values) -> str:
     else:
         where = f"scans of {count} places that were recorded apart"
     return (
-        f"The same small network was trained in {len(values['arms'])} ways on the same "
+        f"The same network was trained in {len(values['arms'])} ways on the same "
         f"{values['labelled']}, and tested on places that it had not seen: {where}, "
         f"with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have the same "
         "iterations and augmentation, unless the table says otherwise. mIoU is the mean over "
@@ -94,7 +94,12 @@ def what_was_done(values: Values) -> str:
 
 def protocol(values: Values) -> list[str]:
     """The facts that another person needs to repeat it."""
-    settings = values["settings"]
+    how = ""
+    if values["trainer"] == "reference":
+        how = (
+            f", grid of {values['settings']['columns']} columns, {values['precision']}; turned and "
+            "mirrored at random in all arms"
+        )
     used = [
         f"{name} ({facts['scans']} scans, {facts['tested']} tested)"
         for name, facts in values["places"].items()
@@ -105,8 +110,7 @@ def protocol(values: Values) -> list[str]:
         "as possible; another "
         "choice with each place and seed. The table says what else an arm uses.",
         f"Trainer: {values['trainer']}; {values['iterations']} iterations of {values['batch']} "
-        f"scans, grid of {settings['columns']} columns, {values['precision']}; turned and mirrored "
-        "at random in all arms.",
+        f"scans{how}.",
         f"Classes: {', '.join(values['classes'])}."
         + (
             f" Not in your labels: {', '.join(values['absent'])}."

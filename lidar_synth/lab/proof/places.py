@@ -23,6 +23,8 @@ STRETCHES = 3
 LEFT_OUT = 0.25
 """Share of the scans of a drive that are left out between its stretches."""
 MOST_POSES = 2000
+AFTER_LOG = "__LIDAR_TOP__"
+"""Follows the log, which is a drive, in nuScenes' names of sweeps."""
 
 _SHUFFLED = "KITTI's frames are shuffled: put mapping/ of the devkit beside training/."
 
@@ -33,6 +35,7 @@ Places = dict[str, list[int]]
 def by_drive(source: Source, names: Sequence[str]) -> Places:
     """A place for each drive (sequence): the source's ``drives``, or what the names of scans have
     before the frame."""
+    names = [name.replace(AFTER_LOG, "/") for name in names]
     folders = [name.rpartition("/")[0] or "all scans" for name in names]
     places: Places = {}
     for index, drive in enumerate(getattr(source, "drives", None) or folders):
@@ -120,14 +123,19 @@ def find_places(source: Source, by: str = "auto", fewest: int = 2) -> Places:
         by_stretch(source, names, int(count)) if count else SPLITS[by](source, names)
     )
     if len(places) < fewest:
+        found = f"one place ({next(iter(places), '')})"
+        hint = (
+            "Add drives or sequences. If a single drive is all there is, split it: --places "
+            "stretch (places='stretch')."
+        )
+        if by == "stretch":
+            found = "drives that are too short to cut"
+            hint = "Add scans: each stretch needs one."
         raise DataError(
-            f"{len(source)} scans of one place ({next(iter(places))})",
+            f"{len(source)} scans of {found}",
             "scans of at least two places, better of five or more: networks are tested on places "
             "that they have not seen",
-            _SHUFFLED
-            if is_shuffled(source)
-            else "Add drives or sequences. If a single drive is all there is, split it: --places "
-            "stretch (places='stretch').",
+            _SHUFFLED if is_shuffled(source) else hint,
         )
     return dict(sorted(places.items()))
 

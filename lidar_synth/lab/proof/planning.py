@@ -1,7 +1,8 @@
 """Making the plan of a comparison: scans are read and checked, the labelled ones chosen, the time
 measured."""
 
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -34,6 +35,8 @@ from lidar_synth.lab.spread import spread
 from lidar_synth.labels.exchange import thin_scan
 from lidar_synth.mixing.sources import sensor_of
 
+log = logging.getLogger(__name__)
+
 
 def make_plan(
     source: Source,
@@ -57,8 +60,8 @@ def make_plan(
         device: on which the reference network computes.
 
     Returns:
-        The plan, and {index: scan on the grid} of all labelled and tested scans. The indices of
-        ``tests`` follow those of ``source``.
+        The plan, and {index: scan on the grid} of the labelled and tested scans of its pairs. The
+        indices of ``tests`` follow those of ``source``.
 
     Raises:
         ConfigError: on settings that do not fit the scans or the sensor, too short a time, a device
@@ -81,22 +84,23 @@ def make_plan(
     tested = {
         place: spread(indices, settings.tested) for place, indices in places.items()
     }
-    needed = sorted(
-        {i for part in (*labelled.values(), *tested.values()) for i in part}
-    )
     names = (*names_of(source), *names_of([] if tests is None else tests))
-    scans = {i: _read(*locate(source, tests, i), grid, settings.beams) for i in needed}
     recordings = recordings_of_scans(
         source if tests is None else tests,
         [names[i] for part in tested.values() for i in part],
     )
     if tests is not None:
-        _refuse_shared(scans, len(source))
         seen = recordings_of_scans(source, names_of(source))
         if shared := seen & recordings:
             raise _shared(str(shared))
-    absent = require_labels(_counts(scans), groups, settings.only)
-    batch = [scans[i] for i in needed[: settings.batch]]
+
+    def read(indices: Collection[int]) -> dict[int, Scan]:
+        return {
+            i: _read(*locate(source, tests, i), grid, settings.beams)
+            for i in sorted(indices)
+        }
+
+    batch = [*read(labelled[pairs[0]][: settings.batch]).values()]
     half = earlier.get("half") if earlier else None
     half, step = measure_step(batch, settings, half, device)
     if earlier and minutes is not None:
@@ -111,7 +115,7 @@ def make_plan(
         grid,
         arms,
         groups,
-        absent,
+        [],
         pairs,
         len(pairs),
         labelled,
@@ -124,7 +128,12 @@ def make_plan(
         jobs,
         device,
     )
-    return within(plan, minutes, resumed=bool(earlier)), scans
+    plan = within(plan, minutes, resumed=bool(earlier))
+    scans = read({i for p in plan.pairs for i in (*labelled[p], *tested[p[0]])})
+    if tests is not None:
+        _refuse_shared(scans, len(source))
+    absent = require_labels(_counts(scans), groups, settings.only)
+    return replace(plan, absent=absent), scans
 
 
 def recordings_of_scans(source: Source, names: Sequence[str]) -> Recordings:
@@ -150,7 +159,7 @@ def _split(
     """The places of the labelled scans, None if they are left out in turn, and those that are
     tested."""
     if tests is None:
-        return None, find_places(source, by)
+        return None, _with_labels(source, find_places(source, by))
     own = sensor_of(source)
     other = sensor_of(tests)
     if other.name != own.name:
@@ -161,7 +170,17 @@ def _split(
         )
     found = find_places(tests, by, fewest=1)
     tested = {name: [len(source) + i for i in part] for name, part in found.items()}
-    return by_drive(source, names_of(source)), tested
+    return _with_labels(source, by_drive(source, names_of(source))), tested
+
+
+def _with_labels(source: Source, places: Places) -> Places:
+    """The places whose first scan has labels: test sequences have none. Warns of the others."""
+    kept = {n: p for n, p in places.items() if source[p[0]].label is not None}
+    if 0 < len(kept) < len(places):
+        log.warning(
+            f"left out, without labels: {', '.join(sorted(places.keys() - kept))}"
+        )
+    return kept or places
 
 
 def _refuse_shared(scans: Mapping[int, Scan], labelled: int) -> None:

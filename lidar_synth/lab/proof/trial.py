@@ -75,7 +75,7 @@ class Job:
         return self.real[0].sensor
 
     def stages(self) -> Iterator[tuple[ArmStage, int]]:
-        """The stages with their iterations, which add up to ``iterations``."""
+        """The stages that have iterations, with their number; all add up to ``iterations``."""
         stages = self.row.stages()
         done = 0
         for number, stage in enumerate(stages):
@@ -84,7 +84,8 @@ class Job:
                 self.iterations - done if last else round(stage.share * self.iterations)
             )
             done += count
-            yield stage, count
+            if count:
+                yield stage, count
 
     def mixtures(self, **options: Any) -> Iterator[tuple[MixedScans, int]]:
         """The training sets of the stages, one after the other, with their iterations.

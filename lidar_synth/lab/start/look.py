@@ -1,7 +1,9 @@
 """What lies in a folder of scans: layout, labels, boxes and sensor, which is fitted if it is not
 known."""
 
+import logging
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,8 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.fitting import SensorFit, fit_sensor
 from lidar_synth.lab.proof.places import by_drive, is_shuffled, names_of
 from lidar_synth.lab.spread import spread
+
+log = logging.getLogger(__name__)
 
 LOOKED = 8
 """Scans that are looked at, evenly spaced."""
@@ -81,8 +85,9 @@ class Findings:
         if self.overlapping:
             boxes += f"; {self.overlapping} overlap one of their class"
         doubts = " ".join(self.fit.uncertain) if self.fit else ""
+        split = f", split {name}," if (name := self.options.get("split")) else ""
         return [
-            f"scans    {len(source)} of layout {self.layout} in {drives}: {source.root}",
+            f"scans    {len(source)} of layout {self.layout}{split} in {drives}: {source.root}",
             f"labels   {labels}, in {self.labelled} of {self.looked} scans looked at",
             f"boxes    {boxes or 'none'}",
             f"sensor   {source.sensor.grid_text()}, {self.known}. {doubts}".rstrip(
@@ -94,7 +99,8 @@ class Findings:
 def look(
     root: Path, sensor: str | Path | None, fitted: Path, reading: dict[str, Any]
 ) -> Findings:
-    """Look at the scans of a folder.
+    """Look at the scans of a folder; where some have labels, at its split "train" if all of that
+    have.
 
     Args:
         root: the folder.
@@ -127,7 +133,7 @@ def look(
     scans = [source[i] for i in spread(range(len(source)), LOOKED)]
     if fit is not None:
         options["sensor"] = str(fitted)
-    return Findings(
+    found = Findings(
         source,
         layout,
         options,
@@ -139,6 +145,14 @@ def look(
         known,
         fit,
     )
+    if reading.get("split") or not 0 < found.labelled < found.looked:
+        return found
+    with suppress(ConfigError, DataError):  # the layout or the folder has no such split
+        train = look(root, sensor, fitted, reading | {"split": "train"})
+        if train.labelled == train.looked:
+            log.warning(f"{root} has scans without labels: its split 'train' is taken")
+            return train
+    return found
 
 
 def _fit(root: Path, reading: dict[str, Any]) -> SensorFit | None:

@@ -141,7 +141,7 @@ class StartPlan:
         sensor = self.found.source.sensor
         if not self.cast and not sensor.same_grid(_model_sensor()):
             settings["as_sensor"] = self.sensor_name()
-            plain = not self.found.options.keys() - {"sensor"}
+            plain = not self.found.options.keys() - {"sensor", "split"}
             if plain and not sensor.same_lasers(_model_sensor()):
                 like = str(self.found.source.root)
                 settings["as_sensor"] = {"sensor": self.sensor_name(), "like": like}
@@ -179,7 +179,7 @@ _RECIPES = {
     "labelled frames, 1.5 with 24, on unseen streets)",
     "detection": "alone for 30 of 40 epochs, then half of each batch, the last two your scans "
     "alone; your objects pasted into all (gained 28 AP over GT sampling with 4 frames)",
-    "unlabelled": "alone, since your scans have no labels; then settle the network on your scans "
+    "unlabelled": "alone, since your scans lack labels; then settle the network on your scans "
     "(beat 12 labelled frames alone)",
 }
 
@@ -282,7 +282,8 @@ def _task(found: Findings, given: str | None) -> str:
     if given not in found.tasks:
         raise ConfigError(
             f"--task {given} for {found.source.root}",
-            f"{' or '.join(found.tasks) or 'no task: the scans have no labels'}",
+            " or ".join(found.tasks)
+            or f"labels, which {found.labelled} of {found.looked} scans looked at have",
         )
     return given
 
@@ -432,14 +433,15 @@ def _cost(minutes: float, size: float) -> str:
 def _configure(plan: StartPlan, trainer: str) -> dict[str, str]:
     task = "segmentation" if plan.task == "unlabelled" else plan.task
     root = str(plan.found.source.root)
-    return configure(
-        trainer, task, plan.settings(), root, str(plan.out), _options(plan)
-    )
+    return configure(trainer, task, plan.settings(), root, str(plan.out), _real(plan))
 
 
-def _options(plan: StartPlan) -> str:
-    """The further arguments of ``open_scans``, as Python."""
-    return "".join(f", {k}={v!r}" for k, v in plan.found.options.items())
+def _real(plan: StartPlan) -> str:
+    """What opens the real scans, as Python."""
+    given = "".join(f", {k}={v!r}" for k, v in plan.found.options.items())
+    cropped = plan.task == "detection" and isinstance(plan.found.source, CameraBoxes)
+    boxed = ".with_boxes()" if cropped else ""
+    return f"open_scans({str(plan.found.source.root)!r}{given}){boxed}"
 
 
 def _code(plan: StartPlan) -> str:
@@ -451,12 +453,10 @@ def _code(plan: StartPlan) -> str:
         given += f", ratio={settings['ratio']}, epoch_size={settings['epoch_size']!r}"
     detection = plan.task == "detection"
     target = "boxes" if detection else "label"
-    cropped = detection and isinstance(plan.found.source, CameraBoxes)
-    boxed = ".with_boxes()" if cropped else ""
     if detection:
         given += ', task="detection"'
     return f"""import lidar_synth
-real = lidar_synth.open_scans({str(plan.found.source.root)!r}{_options(plan)}){boxed}
+real = lidar_synth.{_real(plan)}
 train = lidar_synth.mix(real, {str(plan.synthetic)!r}, {given})
 loader = train.loader(batch_size=4)
 for epoch in range({EPOCHS}):

@@ -1,12 +1,13 @@
 """Configurations of trainers for a mixture: the files that a user of each would write.
 
-``ROOT`` stands for the folder of the real scans, ``OPTIONS`` for those of ``open_scans``, ``MIX``
-for the settings of the mixture, and ``HERE`` for the folder of these files. To add a trainer, enter
-its files in ``TRAINERS``; every one begins with a comment that says where it belongs and what to
-type.
+``ROOT`` stands for the folder of the real scans, ``REAL`` for the Python that opens them, ``MIX``
+for the settings of the mixture, and ``HERE`` for the folder of these files; paths after no
+quotation mark are for a shell. To add a trainer, enter its files in ``TRAINERS``; every one begins
+with a comment that says where it belongs and what to type.
 """
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -123,8 +124,8 @@ from lidar_synth.integrations.lightning import MixedData
 
 with open("MIX") as file:
     settings = yaml.safe_load(file)
-real = open_scans("ROOT"OPTIONS)
-data = MixedData(mix(real, settings.pop("synthetic"), **settings), batch_size=4)
+train = mix(REAL, settings.pop("synthetic"), **settings)
+data = MixedData(train, batch_size=4)
 trainer = lightning.Trainer(use_distributed_sampler=False, max_epochs=40)
 trainer.fit(MODEL, data)
 """
@@ -139,13 +140,17 @@ TRAINERS: dict[str, dict[str, dict[str, str]]] = {
     "waffleiron": {"segmentation": {"train.sh": _WAFFLEIRON}},
     "lightning": {
         "segmentation": {"train.py": _LIGHTNING},
-        "detection": {"train.py": _LIGHTNING},
+        "detection": {
+            "train.py": _LIGHTNING.replace(
+                "**settings", '**settings, epochs=40, task="detection"'
+            )
+        },
     },
 }
 """{trainer: {task: {name of a file: its text}}}."""
 
 MIX = "mix.yaml"
-_WORDS = re.compile(r"\b(?:ROOT|MIX|HERE)\b|OPTIONS")
+_WORDS = re.compile(r'"?\b(?:ROOT|REAL|MIX|HERE)\b')
 
 DEFAULTS: dict[str, dict[str, Any]] = {
     "segmentation": {"epochs": 40},
@@ -179,7 +184,7 @@ def configure(
     settings: dict[str, Any],
     root: str = "/data/scans",
     here: str = "/data/start",
-    options: str = "",
+    real: str | None = None,
 ) -> dict[str, str]:
     """The files of a trainer for a mixture.
 
@@ -189,7 +194,7 @@ def configure(
         settings: of the mixture, as ``read_settings`` reads them.
         root: folder of the real scans.
         here: folder in which the files will lie.
-        options: further arguments of ``open_scans``, as Python.
+        real: what opens the real scans, as Python; by default ``open_scans`` of the folder.
 
     Returns:
         {name: text}; the first one is the mixture.
@@ -203,8 +208,9 @@ def configure(
             f"--trainer {trainer} for {task}",
             f"one of {', '.join(able)}" if able else "segmentation or detection",
         )
-    words = {"ROOT": root, "MIX": f"{here}/{MIX}", "HERE": here}
-    words["OPTIONS"] = options
+    words = {"REAL": real or f"open_scans({root!r})"}
+    for word, path in {"ROOT": root, "MIX": f"{here}/{MIX}", "HERE": here}.items():
+        words |= {word: shlex.quote(path), f'"{word}': f'"{path}'}
     files = {MIX: write_mixture(settings)}
     for name, text in TRAINERS[trainer][task].items():
         files[name] = _WORDS.sub(lambda found: words[found[0]], text)
