@@ -425,7 +425,7 @@ BAD = {
     "too few for stretches": (
         Scans(["00/0", "00/1"]),
         {"places": "stretch"},
-        "2 scans of drives that are too short to cut.*Add scans",
+        "2 scans of drives too short to cut.*sequences or scans",
     ),
     "one cluster of poses": (
         Scans([f"00/{i}" for i in range(4)], [0, 1, 2, 3]),

@@ -123,19 +123,15 @@ def find_places(source: Source, by: str = "auto", fewest: int = 2) -> Places:
         by_stretch(source, names, int(count)) if count else SPLITS[by](source, names)
     )
     if len(places) < fewest:
-        found = f"one place ({next(iter(places), '')})"
-        hint = (
-            "Add drives or sequences. If a single drive is all there is, split it: --places "
-            "stretch (places='stretch')."
-        )
-        if by == "stretch":
-            found = "drives that are too short to cut"
-            hint = "Add scans: each stretch needs one."
+        alone = f"one place ({', '.join(places)})"
         raise DataError(
-            f"{len(source)} scans of {found}",
+            f"{len(source)} scans of {alone if places else 'drives too short to cut'}",
             "scans of at least two places, better of five or more: networks are tested on places "
             "that they have not seen",
-            _SHUFFLED if is_shuffled(source) else hint,
+            _SHUFFLED
+            if is_shuffled(source)
+            else "Add drives, sequences or scans. If a single drive is all there is, split it: "
+            "--places stretch (places='stretch').",
         )
     return dict(sorted(places.items()))
 
