@@ -12,7 +12,7 @@ from banks import add_stray, some_image
 
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.compiled import keep_compiled_code
-from lidar_synth.files.disk import remove_file, write_arrays, write_file
+from lidar_synth.files.disk import files_below, remove_file, write_arrays, write_file
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.npz import read_arrays, write_range_image, write_scan
 from lidar_synth.geometry.projection import unproject
@@ -94,3 +94,14 @@ def test_a_file_that_cannot_be_removed_is_named(
             remove_file(path)
     remove_file(path)
     assert not path.exists()
+
+
+def test_only_links_are_resolved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Many folders are listed in a moment."""
+    for number in range(3):
+        (tmp_path / str(number) / "lidar").mkdir(parents=True)
+        (tmp_path / str(number) / "lidar" / "a.bin").touch()
+    monkeypatch.setattr(Path, "resolve", lambda path: pytest.fail(str(path)))
+    assert len(list(files_below(tmp_path))) == 3

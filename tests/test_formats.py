@@ -14,7 +14,6 @@ from roundtrips import back, same
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, LibraryError
-from lidar_synth.files.disk import files_below
 from lidar_synth.formats import (
     KITTI360,
     READERS,
@@ -444,17 +443,6 @@ def test_links_to_folders_are_followed_but_not_in_circles(
     source = open_scans(folder)
     assert type(source) is READERS[WRITTEN_AS[to]]
     assert source.ids == ("b/000000",)
-
-
-def test_only_links_are_resolved(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Many folders are listed in a moment."""
-    for number in range(3):
-        (tmp_path / str(number) / "lidar").mkdir(parents=True)
-        (tmp_path / str(number) / "lidar" / "a.bin").touch()
-    monkeypatch.setattr(Path, "resolve", lambda path: pytest.fail(str(path)))
-    assert len(list(files_below(tmp_path))) == 3
 
 
 def beside_clouds(root: Path, name: str, content: bytes) -> Path:

@@ -374,7 +374,7 @@ def test_scans_of_other_places_are_tested_by_one_training_for_each_seed() -> Non
     assert plan.tested == {"00": [5, 6], "01": [7, 8], "02": [9, 10]}
     assert scans[7].id == tests[2].id and plan.skin_scans("00") == list(range(5))
     assert "all tested places" in describe_plan(plan)
-    for minutes, seeds in ((0.11, 1), (0.5, 2)):
+    for minutes, seeds in ((1.4, 1), (1.5, 2)):
         short = within(replace(plan, step=0.2), minutes)
         assert short.pairs == plan.pairs[: 3 * seeds] and short.minutes <= minutes
 

@@ -4,7 +4,6 @@ import math
 import os
 import tracemalloc
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -184,41 +183,6 @@ def test_a_cache_of_scans_that_have_changed_is_refused(
     corrected = next(root.rglob("*.label"))
     os.utime(corrected, (0, corrected.stat().st_mtime + 60))  # as large as before
     with pytest.raises(ConfigError, match=r"cache of other data \(files differ\)"):
-        cache()
-
-
-@pytest.mark.parametrize("channels", [["range"], ["range", "label"]])
-def test_a_cache_of_kitti360_depends_on_the_files_of_its_drives_and_channels_alone(
-    channels: list[str], tmp_path: Path
-) -> None:
-    root = tmp_path / "scans"
-    writer = WRITERS["kitti360"](root, drive="2013_05_28_drive_0004_sync")
-    for i, scan in enumerate(SCANS):
-        writer.write(scan, i)
-    writer.finish()
-
-    def cache() -> None:
-        source = open_scans(root, split="r2flow/train")
-        cache_scans(source, SENSOR, channels, tmp_path / "cache", progress=False)
-
-    cache()
-    test = WRITERS["kitti360"](root, drive="2013_05_28_drive_0000_sync")
-    test.write(SCANS[0], 0)
-    test.finish()
-    for later in ("data_3d_bboxes/train/2013_05_28_drive_0004_sync.xml", "a.ply"):
-        (root / later).parent.mkdir(parents=True, exist_ok=True)
-        (root / later).write_text("<x/>")
-    cache()
-    suffixes = ("label", "bin") if "label" in channels else ("bin",)
-    for suffix in suffixes:
-        changed = next(root.rglob(f"*0004_sync/**/*.{suffix}"))
-        before = changed.stat().st_mtime
-        os.utime(changed, (0, before + 60))
-        with pytest.raises(ConfigError, match=r"cache of other data \(files differ\)"):
-            cache()
-        os.utime(changed, (0, before))
-    next(root.rglob("*0004_sync/**/*.label")).unlink()
-    with nullcontext() if channels == ["range"] else pytest.raises(ConfigError):
         cache()
 
 

@@ -1,6 +1,8 @@
 """Runs that are disturbed: caches that two of them open, failures while saving, patience that ends
 before the rate falls, and starts that contradict the configuration."""
 
+import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import pytest
 from conftest import random_scan
 
 from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -140,3 +143,38 @@ def test_a_conditional_start_keeps_its_condition_and_takes_other_shares(
         header("{kind: layout, dropout: 0.5}")
     with pytest.raises(ConfigError, match="condition.arguments"):
         header("{kind: semantic, arguments: {channels: 77}}")
+
+
+@pytest.mark.parametrize("channels", [["range"], ["range", "label"]])
+def test_a_cache_of_kitti360_depends_on_the_files_of_its_drives_and_channels_alone(
+    channels: list[str], tmp_path: Path
+) -> None:
+    root = tmp_path / "scans"
+    writer = WRITERS["kitti360"](root, drive="2013_05_28_drive_0004_sync")
+    for seed in range(2):
+        writer.write(random_scan(SENSOR, 400, seed), seed)
+    writer.finish()
+
+    def cache() -> None:
+        source = open_scans(root, split="r2flow/train")
+        cache_scans(source, SENSOR, channels, tmp_path / "cache", progress=False)
+
+    cache()
+    test = WRITERS["kitti360"](root, drive="2013_05_28_drive_0000_sync")
+    test.write(random_scan(SENSOR, 400), 0)
+    test.finish()
+    for later in ("data_3d_bboxes/train/2013_05_28_drive_0004_sync.xml", "a.ply"):
+        (root / later).parent.mkdir(parents=True, exist_ok=True)
+        (root / later).write_text("<x/>")
+    cache()
+    suffixes = ("label", "bin") if "label" in channels else ("bin",)
+    for suffix in suffixes:
+        changed = next(root.rglob(f"*0004_sync/**/*.{suffix}"))
+        before = changed.stat().st_mtime
+        os.utime(changed, (0, before + 60))
+        with pytest.raises(ConfigError, match=r"cache of other data \(files differ\)"):
+            cache()
+        os.utime(changed, (0, before))
+    next(root.rglob("*0004_sync/**/*.label")).unlink()
+    with nullcontext() if channels == ["range"] else pytest.raises(ConfigError):
+        cache()
