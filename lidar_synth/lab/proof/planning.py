@@ -15,7 +15,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import layout_of
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.generate.devices import check_device
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry.scan import LABELLED_ONLY, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.leakage import content_of, recordings_of
 from lidar_synth.lab.proof.arms import rows
@@ -223,8 +223,7 @@ def _read(source: Source, index: int, grid: Sensor | None, beams: int | None) ->
         raise DataError(
             f"scan {scan.id!r} without labels",
             "labelled scans",
-            "lidar-synth label kitti360 makes labels for KITTI-360; other scans need a folder of "
-            "labels.",
+            LABELLED_ONLY,
         )
     wrong = (scan.label >= len(NAMES)) & (scan.label != IGNORE)
     if wrong.any():
