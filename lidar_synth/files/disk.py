@@ -361,7 +361,7 @@ def read_text(
         DataError: if it is not UTF-8 text, or too long.
     """
     try:
-        return read_file(path, expected, at_most).decode("utf-8-sig")
+        return read_file(path, expected, at_most).decode().removeprefix("\ufeff")
     except UnicodeDecodeError as error:
         raise DataError(
             f"{path} is not a text file ({error.reason})", "UTF-8 text"
