@@ -344,6 +344,9 @@ def test_drives_without_labels_are_left_out(caplog: pytest.LogCaptureFixture) ->
     assert list(plan.places) == ["00", "01"] and "without labels: 02" in caplog.text
     plan, _ = make_plan(source, SMALL, None, 1, tests=drives(1, 2, first=20))
     assert max(i for part in plan.labelled.values() for i in part) < 8
+    source[4:8] = [replace(scan, label=None, raw_label=None) for scan in source[4:8]]
+    with pytest.raises(DataError, match=r"of one place \(00\).*--places stretch"):
+        make_plan(source, SMALL, None, 1)
 
 
 def test_scans_of_other_pairs_are_not_held(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,7 +81,9 @@ def assumed_size(camera: Calibration) -> tuple[int, int]:
     Raises:
         DataError: if no image has it in the centre.
     """
+    if camera.image_size:
+        return camera.image_size
     centred = np.rint(2 * camera.projection[:2, 2])
-    if camera.image_size or np.allclose(centred, IMAGE_SIZE, rtol=FAR):
-        return camera.image_size or IMAGE_SIZE
+    if np.allclose(centred, IMAGE_SIZE, rtol=FAR):
+        return IMAGE_SIZE
     return read_image_size(centred, "the principal point of P2")

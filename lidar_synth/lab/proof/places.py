@@ -92,7 +92,9 @@ SPLITS: dict[str, Callable[[Source, Sequence[str]], Places]] = {
 """Ways to find places, by name."""
 
 
-def find_places(source: Source, by: str = "auto", fewest: int = 2) -> Places:
+def find_places(
+    source: Source, by: str = "auto", fewest: int = 2, labelled: bool = False
+) -> Places:
     """The places of a source.
 
     Args:
@@ -100,6 +102,8 @@ def find_places(source: Source, by: str = "auto", fewest: int = 2) -> Places:
         by: a name of ``SPLITS``; ``"auto"`` takes drives if there are at least two, and otherwise
             clusters of poses. ``"stretch:2"`` is the split with two stretches.
         fewest: places that are needed.
+        labelled: leave out the places whose first scan has no labels, with a warning: test
+            sequences have none. Where no place has any, all are kept.
 
     Raises:
         ConfigError: on an unknown split.
@@ -122,6 +126,8 @@ def find_places(source: Source, by: str = "auto", fewest: int = 2) -> Places:
     places = (
         by_stretch(source, names, int(count)) if count else SPLITS[by](source, names)
     )
+    if labelled:
+        places = _with_labels(source, places)
     if len(places) < fewest:
         alone = f"one place ({', '.join(places)})"
         raise DataError(
@@ -134,6 +140,14 @@ def find_places(source: Source, by: str = "auto", fewest: int = 2) -> Places:
             "--places stretch (places='stretch').",
         )
     return dict(sorted(places.items()))
+
+
+def _with_labels(source: Source, places: Places) -> Places:
+    kept = {n: p for n, p in places.items() if source[p[0]].label is not None}
+    if 0 < len(kept) < len(places):
+        without = sorted(places.keys() - kept)
+        log.warning("left out, without labels: %s", ", ".join(without))
+    return kept or places
 
 
 def is_shuffled(source: Source) -> bool:

@@ -1,7 +1,6 @@
 """Making the plan of a comparison: scans are read and checked, the labelled ones chosen, the time
 measured."""
 
-import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -23,7 +22,6 @@ from lidar_synth.lab.proof.beams import coarser, keep_beams
 from lidar_synth.lab.proof.budget import measure_step, within
 from lidar_synth.lab.proof.places import (
     Places,
-    by_drive,
     choose,
     find_places,
     names_of,
@@ -34,8 +32,6 @@ from lidar_synth.lab.proof.settings import MOST_LABELLED, ProofSettings
 from lidar_synth.lab.spread import spread
 from lidar_synth.labels.exchange import thin_scan
 from lidar_synth.mixing.sources import sensor_of
-
-log = logging.getLogger(__name__)
 
 
 def make_plan(
@@ -159,7 +155,7 @@ def _split(
     """The places of the labelled scans, None if they are left out in turn, and those that are
     tested."""
     if tests is None:
-        return None, _with_labels(source, find_places(source, by))
+        return None, find_places(source, by, labelled=True)
     own = sensor_of(source)
     other = sensor_of(tests)
     if other.name != own.name:
@@ -170,17 +166,7 @@ def _split(
         )
     found = find_places(tests, by, fewest=1)
     tested = {name: [len(source) + i for i in part] for name, part in found.items()}
-    return _with_labels(source, by_drive(source, names_of(source))), tested
-
-
-def _with_labels(source: Source, places: Places) -> Places:
-    """The places whose first scan has labels: test sequences have none. Warns of the others."""
-    kept = {n: p for n, p in places.items() if source[p[0]].label is not None}
-    if 0 < len(kept) < len(places):
-        log.warning(
-            f"left out, without labels: {', '.join(sorted(places.keys() - kept))}"
-        )
-    return kept or places
+    return find_places(source, "drive", fewest=1, labelled=True), tested
 
 
 def _refuse_shared(scans: Mapping[int, Scan], labelled: int) -> None:

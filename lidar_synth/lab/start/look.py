@@ -150,7 +150,7 @@ def look(
     with suppress(ConfigError, DataError):  # the layout or the folder has no such split
         train = look(root, sensor, fitted, reading | {"split": "train"})
         if train.labelled == train.looked:
-            log.warning(f"{root} has scans without labels: its split 'train' is taken")
+            log.warning("%s has scans without labels: its split train is taken", root)
             return train
     return found
 
