@@ -50,6 +50,8 @@ COMMANDS = {
     "convert, webdataset": "convert TOWN OUT --to webdataset",
     "sample": "sample OUT --model MODEL --count 12 --to npz",
     "bake": "bake OUT --model MODEL --count 24 --shard-size 3",
+    "bake, processes": "bake OUT --model MODEL --count 16 --shard-size 1 "
+    "--engine processes --workers 2",
     "bank merge": "bank merge OUT BANK OTHER",
     "bank head": "bank head BANK OUT --count 20",
     "bank split": "bank split BANK OUT/a=0.5 OUT/b=0.5",
