@@ -5,6 +5,7 @@ from typing import Any
 from torch import Tensor
 
 from lidar_synth.generate.flow.path import per_sample
+from lidar_synth.generate.flow.timesteps import Selection, sum_costs
 
 MEAN = 0.5
 STD = 0.1
@@ -31,3 +32,9 @@ def gaussian_flow(y: Tensor, start: Tensor, end: Tensor) -> Tensor:
     mean, std = _moments(start, y)
     mean_end, std_end = _moments(end, y)
     return mean_end + std_end / std * (y - mean)
+
+
+def select_timesteps(*args: Any, **options: Any) -> Selection:
+    """The selection of ``sum_costs`` on all of its trajectories."""
+    *_, costs = sum_costs(*args, progress=False, **options)
+    return costs.selection

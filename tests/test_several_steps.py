@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accelerate import Accelerator
+from flows import select_timesteps
 from test_run import call, distilling, one_thread, scans, teacher, write_config
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import load_checkpoint, read_header
 from lidar_synth.generate.flow.path import METRICS
-from lidar_synth.generate.flow.timesteps import select_timesteps
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.lab.train import DistillConfig, load_config
 from lidar_synth.lab.train.loop import weigh_metric
@@ -116,7 +116,7 @@ def test_timesteps_are_selected_by_the_metric_of_the_training(
     stage.prepare(data, Accelerator(cpu=True))
     plain = METRICS["pseudo_huber"]
     by_each, by_none = (
-        select_timesteps(stage.flow, stage.codec.shape, 4, 6, 2, metric, progress=False)
+        select_timesteps(stage.flow, stage.codec.shape, 4, 6, 2, metric)
         for metric in (weigh_metric(plain, recipe["weights"], data.tensors), plain)
     )
     cost = stage.header.provenance["selection"]["cost"]

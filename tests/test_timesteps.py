@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from flows import gaussian_velocity
+from flows import gaussian_velocity, select_timesteps
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -19,7 +19,6 @@ from lidar_synth.generate.flow.timesteps import (
     best_path,
     cost_matrix,
     path_cost,
-    select_timesteps,
 )
 from lidar_synth.noise import gaussian
 
@@ -64,9 +63,7 @@ def test_the_knots_of_a_piecewise_linear_flow_are_found(
         piece = (t[:, None] <= torch.tensor(knots[1:]) + 1e-6).sum(1)
         return velocities[piece]
 
-    found = select_timesteps(
-        velocity, SHAPE, len(knots) - 1, 50, 3, metric, progress=False
-    )
+    found = select_timesteps(velocity, SHAPE, len(knots) - 1, 50, 3, metric)
     assert found.grid == pytest.approx(knots)
     assert found.cost < 1e-6 < found.uniform_cost or knots == (1.0, 0.5, 0.0)
     assert np.allclose(found.per_trajectory, knots[1:-1])
@@ -107,7 +104,6 @@ def test_the_selection_minimises_the_mean_cost_of_a_curved_flow() -> None:
         "squared_l2",
         seed=3,
         batch=3,
-        progress=False,
     )
     noise = gaussian(3, range(7), SHAPE)
     costs = cost_matrix(
@@ -137,8 +133,7 @@ def test_the_selection_minimises_the_mean_cost_of_a_curved_flow() -> None:
 @pytest.mark.slow
 def test_the_batch_size_changes_only_rounding() -> None:
     one, three = (
-        select_timesteps(gaussian_velocity, SHAPE, 3, 20, 8, batch=b, progress=False)
-        for b in (1, 3)
+        select_timesteps(gaussian_velocity, SHAPE, 3, 20, 8, batch=b) for b in (1, 3)
     )
     assert one.grid == three.grid
     assert np.allclose(
@@ -166,7 +161,6 @@ def test_a_custom_metric_and_one_condition_per_trajectory() -> None:
         lambda a, b: (a - b).abs().amax((1, 2, 3)),
         batch=2,
         condition=condition,
-        progress=False,
     )
     assert requested == [range(2), range(2, 3)]
     # v = c t on a grid of quarters, c = 1, 11, 21: a straight step from t = 1 to 1/2 has an error
@@ -190,7 +184,7 @@ def test_memory_does_not_grow_with_the_number_of_trajectories() -> None:
             seen.append(live())
             return -y
 
-        select_timesteps(velocity, SHAPE, 2, 5, trajectories, progress=False)
+        select_timesteps(velocity, SHAPE, 2, 5, trajectories)
         return max(seen[-5:])
 
     assert peaks(2) == peaks(9)
@@ -199,9 +193,7 @@ def test_memory_does_not_grow_with_the_number_of_trajectories() -> None:
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_teacher_with_nan_or_infinity_is_refused(bad: float) -> None:
     with pytest.raises(DataError, match="the teacher's trajectory is not finite"):
-        select_timesteps(
-            lambda y, t, c: torch.full_like(y, bad), SHAPE, 2, 5, 2, progress=False
-        )
+        select_timesteps(lambda y, t, c: torch.full_like(y, bad), SHAPE, 2, 5, 2)
 
 
 @pytest.mark.parametrize(
@@ -219,5 +211,5 @@ def test_invalid_numbers_are_refused(options: dict[str, Any], message: str) -> N
         select_timesteps(
             gaussian_velocity,
             SHAPE,
-            **{"candidates": 5, "trajectories": 2, "progress": False} | options,
+            **{"candidates": 5, "trajectories": 2} | options,
         )

@@ -63,7 +63,7 @@ def adaptive_piecewise(
 ) -> Example:
     """Algorithm 1: at the start t_i of a random interval and y = (1 - t_i) y0 + t_i y1, the target
     is the constant velocity to the teacher's state at the end of the interval. ``grid`` comes from
-    ``select_timesteps``."""
+    a ``Selection``."""
     interval = (u * (len(grid) - 1)).long().clamp_(max=len(grid) - 2)
     start, end = _bounds(interval, grid, u)
     y = interpolate(y0, y1, start)

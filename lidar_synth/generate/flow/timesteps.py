@@ -11,7 +11,6 @@ least total cost, shared by all trajectories: C is averaged first, then dynamic 
 M^2) finds the path. Trajectories are streamed, so that only C is kept in memory.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -94,42 +93,6 @@ class TrajectoryCosts:
         )
 
 
-def select_timesteps(
-    velocity: Velocity,
-    shape: tuple[int, ...],
-    intervals: int = 4,
-    candidates: int = 100,
-    trajectories: int = 256,
-    metric: str | Metric = "pseudo_huber",
-    seed: int = 0,
-    batch: int = 1,
-    device: torch.device | str = "cpu",
-    condition: Callable[[range], Any] | None = None,
-    progress: bool = True,
-) -> Selection:
-    """Select the time grid of N steps on which a teacher's trajectories are straightest.
-
-    Peak memory is that of ``batch`` trajectories (states and velocities: 105 MB each for 2x64x1024
-    and M = 100), independent of the number of trajectories. The arguments and errors are those of
-    ``sum_costs``.
-    """
-    every = sum_costs(
-        velocity,
-        shape,
-        intervals,
-        candidates,
-        trajectories,
-        metric,
-        seed,
-        batch,
-        device,
-        condition,
-        progress,
-    )
-    [costs] = deque(every, maxlen=1)
-    return costs.selection
-
-
 def sum_costs(
     velocity: Velocity,
     shape: tuple[int, ...],
@@ -145,7 +108,11 @@ def sum_costs(
     done: TrajectoryCosts | None = None,
     each: Callable[..., Iterator[tuple[Costs, NDArray[np.int64]]]] = map,
 ) -> Iterator[TrajectoryCosts]:
-    """The costs of a selection, batch by batch.
+    """The costs of a selection, batch by batch: the last ones give the time grid of N steps on
+    which a teacher's trajectories are straightest.
+
+    Peak memory is that of ``batch`` trajectories (states and velocities: 105 MB each for 2x64x1024
+    and M = 100), independent of the number of trajectories.
 
     Args:
         velocity: the teacher.

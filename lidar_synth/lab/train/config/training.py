@@ -128,7 +128,7 @@ def _checked(part: NetworkSpec) -> nn.Module:
 
 
 class SelectionSettings(Section):
-    """The selection of timesteps by ``timesteps.select_timesteps``.
+    """The selection of timesteps by ``timesteps.sum_costs``.
 
     Args:
         candidates: M, the number of candidate times.
