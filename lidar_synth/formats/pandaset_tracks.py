@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import name_errors, read_text
@@ -146,12 +147,7 @@ def _transform(pose: Any) -> Matrix:
         raise DataError(
             f"a heading of length {np.linalg.norm(quaternion):g}", "a unit quaternion"
         )
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
     result = np.eye(4)
-    result[:3, :3] = [
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
+    result[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
     result[:3, 3] = _numbers(pose.get("position"), "x", "y", "z")
     return result
