@@ -33,7 +33,7 @@ from lidar_synth.lab.proof.arms import Row, options_of, policy_of, rows
 from lidar_synth.lab.proof.budget import estimate_minutes, within
 from lidar_synth.lab.proof.command import describe
 from lidar_synth.lab.proof.drawing import ticks
-from lidar_synth.lab.proof.places import APART, SPLITS, choose, clusters, find_places
+from lidar_synth.lab.proof.places import APART, SPLITS, choose, find_places
 from lidar_synth.lab.proof.plan import describe as describe_plan
 from lidar_synth.lab.proof.planning import make_plan
 from lidar_synth.lab.proof.pools import read_pool
@@ -48,6 +48,7 @@ from lidar_synth.lab.proof.scores import (
 )
 from lidar_synth.lab.proof.trial import reference, run_trainer, turn_scan
 from lidar_synth.lab.town import Town
+from lidar_synth.labels.edit.unboxed import join_cubes
 from lidar_synth.labels.exchange import thin_scan
 from lidar_synth.noise import keyed_rng
 
@@ -83,8 +84,8 @@ def test_a_split_has_places_without_a_scan_in_common(by: str) -> None:
 
 def test_places_by_pose_are_apart_from_each_other() -> None:
     rng = np.random.default_rng(0)
-    positions = rng.uniform(0, 1500, (200, 3))
-    cluster = clusters(positions, APART)
+    positions = rng.uniform(0, 1500, (200, 3)) * (1, 1, 0) + 2e7
+    cluster = join_cubes(positions, APART)
     distance = np.linalg.norm(positions[:, None, :2] - positions[None, :, :2], axis=-1)
     assert cluster.max() > 10
     assert distance[cluster[:, None] != cluster[None]].min() >= APART
@@ -122,15 +123,13 @@ def test_places_of_shuffled_frames_are_their_drives(
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, None])
-def test_labelled_scans_come_from_many_places_and_not_from_the_one_left_out(
-    count: int | None,
-) -> None:
-    places = find_places(drives(4, 5))
-    picked = choose(places, "01", count, np.random.default_rng(0))
+def test_labelled_scans_come_from_many_places(count: int | None) -> None:
+    places = find_places(drives(3, 5))
+    picked = choose(places, count, np.random.default_rng(0))
     per_place = Counter(
         next(name for name, part in places.items() if i in part) for i in picked
     )
-    assert "01" not in per_place and len(picked) == (count or 15)
+    assert len(picked) == (count or 15)
     assert (
         max(per_place.values())
         - (min(per_place.values()) if len(per_place) == 3 else 0)

@@ -7,13 +7,13 @@ on.
 
 import logging
 from collections.abc import Callable, Sequence
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Source
+from lidar_synth.labels.edit.unboxed import join_cubes
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ def by_pose(source: Source, names: Sequence[str]) -> Places:
         # Neighbouring frames are metres apart: some of them show where the drive went.
         indices = indices[:: max(1, len(names) // MOST_POSES)]
         positions = np.array([_position(source, i) for i in indices])
-        cluster = clusters(positions, APART)
+        cluster = join_cubes(positions * (1, 1, 0), APART)
         for number in range(cluster.max() + 1):
             name = f"{drive}, place {number + 1}"
             places[name] = [
@@ -161,32 +161,6 @@ def names_of(source: Source) -> list[str]:
     return [source[i].id for i in range(len(source))] if names is None else list(names)
 
 
-def clusters(positions: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
-    """(N,) number of the cluster of each position (N, 3); two clusters are at least ``apart`` from
-    each other.
-
-    Positions in the same or in neighbouring squares of side ``apart`` are of one cluster.
-    """
-    squares, square = np.unique(
-        np.floor(positions[:, :2] / apart).astype(np.int64), axis=0, return_inverse=True
-    )
-    numbers = {tuple(s): i for i, s in enumerate(squares.tolist())}
-    cluster = np.full(len(squares), -1, np.int64)
-    count = 0
-    for start in range(len(squares)):
-        waiting = [start] if cluster[start] < 0 else []
-        count += bool(waiting)
-        while waiting:
-            here = waiting.pop()
-            cluster[here] = count - 1
-            x, y = squares[here].tolist()
-            for dx, dy in product((-1, 0, 1), repeat=2):
-                near = numbers.get((x + dx, y + dy))
-                if near is not None and cluster[near] < 0:
-                    waiting.append(near)
-    return cluster[square.reshape(-1)]
-
-
 def _has_pose(source: Source) -> bool:
     return source[0].pose is not None
 
@@ -202,40 +176,28 @@ def _position(source: Source, index: int) -> NDArray[np.float64]:
     return scan.pose[:3, 3]
 
 
-def choose(
-    places: Places, without: str | None, count: int | None, rng: np.random.Generator
-) -> list[int]:
-    """The labelled scans to train on: at random, from as many places as possible, none from the
-    place left out.
+def choose(places: Places, count: int | None, rng: np.random.Generator) -> list[int]:
+    """The labelled scans to train on: at random, from as many places as possible.
 
     Args:
-        places: the places.
-        without: the place that is tested on; None if it is not among them.
+        places: those that are not tested on.
         count: number of scans; None for all.
         rng: source of the random numbers.
 
     Raises:
         ConfigError: on more scans than there are.
     """
-    piles = [
-        rng.permutation(indices).tolist()
-        for name, indices in places.items()
-        if name != without
-    ]
+    piles = [rng.permutation(indices).tolist() for indices in places.values()]
     there = sum(map(len, piles))
     if count is None:
         return sorted(i for pile in piles for i in pile)
     if not 1 <= count <= there:
         raise ConfigError(
             f"{count} labelled scans",
-            f"1 to {there}, the scans of {_others(without)}",
+            f"1 to {there}, the scans of the places that are not tested",
         )
     order = [piles[i] for i in rng.permutation(len(piles))]
     dealt = [
         pile[n] for n in range(max(map(len, order))) for pile in order if n < len(pile)
     ]
     return sorted(dealt[:count])
-
-
-def _others(without: str | None) -> str:
-    return "all places" if without is None else f"the places other than {without!r}"

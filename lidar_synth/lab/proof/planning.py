@@ -190,12 +190,12 @@ def _labelled(
     place, seed = pair
     if training is not None:
         rng = np.random.default_rng((settings.seed, seed))
-        return choose(training, None, _count_labelled(training, settings), rng)
+        return choose(training, _count_labelled(training, settings), rng)
     others = {name: part for name, part in places.items() if name != place}
     count = _count_labelled(others, settings)
     number = sorted(places).index(place)
     rng = np.random.default_rng((settings.seed, seed, number))
-    return choose(places, place, count, rng)
+    return choose(others, count, rng)
 
 
 def _count_labelled(places: Places, settings: ProofSettings) -> int:

@@ -72,16 +72,29 @@ def clusters(
     number = np.zeros(len(scan), np.int64)
     outside = np.flatnonzero(_outside(scan, classes))
     if len(outside):
-        cube = np.floor(scan.points[outside] / _REACH).astype(np.int64) + (1 << 18)
-        keys, of = np.unique(
-            (cube[:, 0] << 40) | (cube[:, 1] << 20) | cube[:, 2], return_inverse=True
-        )
-        root = np.arange(len(keys))
-        _join(keys, _NEIGHBOURS, root)
-        size = np.bincount(root[of], minlength=len(keys))
-        large = size >= least
-        number[outside] = (np.cumsum(large) * large)[root[of]]
+        group = join_cubes(scan.points[outside], _REACH)
+        large = np.bincount(group) >= least
+        number[outside] = (np.cumsum(large) * large)[group]
     return number
+
+
+def join_cubes(points: NDArray[np.floating], side: float) -> NDArray[np.int64]:
+    """(N,) number of the group of each point, from 0 on in the order of x: points in the same or in
+    touching cubes are of one group, so that two groups are at least ``side`` from each other.
+
+    Args:
+        points: (N, 3) metres, N > 0; they span less than 10^6 cubes.
+        side: of the cubes, metres.
+    """
+    cube = np.floor(points / side).astype(np.int64)
+    cube -= cube.min(0) - 1
+    keys, of = np.unique(
+        (cube[:, 0] << 40) | (cube[:, 1] << 20) | cube[:, 2], return_inverse=True
+    )
+    root = np.arange(len(keys))
+    _join(keys, _NEIGHBOURS, root)
+    group: NDArray[np.int64] = np.unique(root, return_inverse=True)[1]
+    return group[of]
 
 
 def measure(

@@ -187,7 +187,7 @@ class DetectionWork:
         others = {n: i for n, i in self.places.items() if n not in held_out}
         rng = np.random.default_rng((seed, self.settings.labelled))
         count = min(self.settings.labelled, sum(map(len, others.values())))
-        return choose(others, "", count, rng)
+        return choose(others, count, rng)
 
     def tested(self, seed: int) -> dict[str, list[int]]:
         """{place: indices of its scans} that a seed tests on."""
