@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.lab.evaluate.segmentation import tabulate
 from lidar_synth.lab.evaluate.segmenter import CircularConv
 from lidar_synth.lab.proof import Job
 from lidar_synth.lab.train.segmentation import balanced_cross_entropy
@@ -131,6 +132,4 @@ def table_of(network: nn.Module, scans: Sequence[Scan]) -> NDArray[np.int64]:
     """(19, 19) number of returns by label (row) and prediction (column)."""
     label = np.concatenate([scan.label for scan in scans if scan.label is not None])
     guess = torch.cat([network([scan]).argmax(1) for scan in scans]).numpy()
-    table = np.zeros((256, len(NAMES)), np.int64)
-    np.add.at(table, (label, guess), 1)
-    return table[: len(NAMES)]
+    return tabulate(label, guess)

@@ -17,6 +17,17 @@ from lidar_synth.lab.evaluate.statistics import Sparse
 CLASSES = len(NAMES)
 
 
+def require_label(scan: Scan) -> NDArray[np.uint8]:
+    """(N,) the labels of a scan.
+
+    Raises:
+        DataError: on a scan without labels.
+    """
+    if scan.label is None:
+        raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
+    return scan.label
+
+
 def class_histogram(
     scan: Scan,
     field: float = FIELD,
@@ -36,12 +47,11 @@ def class_histogram(
     Raises:
         DataError: on a scan without labels, or without a labelled point between the limits.
     """
-    if scan.label is None:
-        raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
+    label = require_label(scan)
     distance = np.linalg.norm(scan.points, axis=1)
     cell = np.floor((scan.points[:, :2] / field + 0.5) * bins).astype(np.int64)
     kept = (
-        (scan.label != IGNORE)
+        (label != IGNORE)
         & (distance > near)
         & (distance < far)
         & ((cell >= 0) & (cell < bins)).all(1)
@@ -52,7 +62,7 @@ def class_histogram(
             "labelled returns",
         )
     row, column = cell[kept].T
-    index = (scan.label[kept].astype(np.int64) * bins + row) * bins + column
+    index = (label[kept].astype(np.int64) * bins + row) * bins + column
     where, amounts = np.unique(index, return_counts=True)
     return Sparse(where.astype(np.int32), amounts.astype(np.uint16))
 
@@ -64,14 +74,13 @@ def class_shares(scan: Scan, bands: int = 16) -> NDArray[np.float64]:
     Raises:
         DataError: on a scan without labels.
     """
-    if scan.label is None:
-        raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
+    label = require_label(scan)
     ring = np.minimum(
         np.linalg.norm(scan.points[:, :2], axis=1) * bands / 56, bands - 1
     ).astype(np.int64)
-    known = scan.label != IGNORE
+    known = label != IGNORE
     counts = np.bincount(
-        ring[known] * CLASSES + scan.label[known], minlength=bands * CLASSES
+        ring[known] * CLASSES + label[known], minlength=bands * CLASSES
     )
     table = counts.reshape(bands, CLASSES).astype(np.float64)
     shares: NDArray[np.float64] = table / np.maximum(table.sum(1, keepdims=True), 1)

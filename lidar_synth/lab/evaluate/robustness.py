@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
+from lidar_synth.datasets.classes import NAMES, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names, read_values
@@ -25,7 +25,8 @@ from lidar_synth.files.parsing import read_facts
 from lidar_synth.formats.point_labels import decode_labels
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.geometry.scan import Scan, Source, scan_hash
-from lidar_synth.lab.evaluate.segmentation import load_judge, mean_iou
+from lidar_synth.lab.evaluate.labels import require_label
+from lidar_synth.lab.evaluate.segmentation import load_judge, mean_iou, tabulate
 from lidar_synth.lab.evaluate.street_judge import load_archive
 from lidar_synth.noise import keyed_rng
 from lidar_synth.weather import BENCHMARK, CORRUPTIONS, SEVERITIES
@@ -215,8 +216,7 @@ def corrupt(scans: Source, case: str, seed: int = 0) -> Iterator[Scan]:
     change = CORRUPTIONS[name].at(severity) if severity else None
     for number in range(len(scans)):
         scan = scans[number]
-        if scan.label is None:
-            raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
+        require_label(scan)
         yield scan if change is None else change(scan, keyed_rng(seed, number))
 
 
@@ -279,13 +279,8 @@ def count_points(scan: Scan, predicted: Any) -> Table:
             f"({len(scan)},), a train id for each point",
         )
     count = len(NAMES)
-    assert scan.label is not None
-    valid = scan.label != IGNORE
     known = (values >= 0) & (values < count)
-    pairs = (
-        scan.label[valid] * np.int64(count + 1) + np.where(known, values, count)[valid]
-    )
-    return np.bincount(pairs, minlength=count * (count + 1)).reshape(count, count + 1)
+    return tabulate(require_label(scan), np.where(known, values, count), count + 1)
 
 
 def sum_tables(tables: Iterable[Table]) -> Table:

@@ -26,6 +26,7 @@ from lidar_synth.files.disk import read_file, write_file
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.evaluate.labels import require_label
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
 
 FORMAT = "lidar-synth-segmenter/1"
@@ -39,16 +40,24 @@ def confusion(
     network: nn.Module, batches: Iterable[Images], height: Tensor
 ) -> NDArray[np.int64]:
     """(19, 19) number of cells by label (row) and prediction (column), without ignored cells."""
-    count = len(NAMES)
-    table = torch.zeros(count * count, dtype=torch.int64)
+    table = np.zeros((len(NAMES), len(NAMES)), np.int64)
     with torch.inference_mode():
         for batch in batches:
             seen = segmenter_input(batch["range"], batch["reflectance"], height)
-            predicted = network(seen).argmax(1).cpu()
-            valid = batch["label"] != IGNORE
-            pairs = batch["label"][valid].long() * count + predicted[valid]
-            table += torch.bincount(pairs, minlength=count * count)
-    return table.reshape(count, count).numpy()
+            predicted = network(seen).argmax(1).cpu().numpy()
+            table += tabulate(batch["label"].numpy(), predicted)
+    return table
+
+
+def tabulate(
+    label: NDArray[np.uint8], predicted: NDArray[np.integer], columns: int = len(NAMES)
+) -> NDArray[np.int64]:
+    """(19, columns) number of elements by label (row) and prediction (column), without ignored
+    ones; the arrays have one shape."""
+    valid = label != IGNORE
+    pairs = label[valid].astype(np.int64) * columns + predicted[valid]
+    counts = np.bincount(pairs, minlength=len(NAMES) * columns)
+    return counts.reshape(len(NAMES), columns)
 
 
 def class_ious(table: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -113,10 +122,7 @@ class Judge:
 
         def labelled() -> Iterator[Images]:
             for scan in scans:
-                if scan.label is None:
-                    raise DataError(
-                        f"scan {scan.id!r} without labels", "labelled scans"
-                    )
+                require_label(scan)
                 yield self._images([scan])
 
         return confusion(self.network, labelled(), self.height)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import carry
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.evaluate.extractors.archive import Archive
@@ -27,6 +27,8 @@ from lidar_synth.lab.evaluate.extractors.bonnetal import (
     read_segmenter,
 )
 from lidar_synth.lab.evaluate.extractors.inputs import CHANNELS, nearest_points
+from lidar_synth.lab.evaluate.labels import require_label
+from lidar_synth.lab.evaluate.segmentation import tabulate
 
 
 @dataclass(frozen=True)
@@ -49,16 +51,12 @@ class StreetJudge:
         Raises:
             DataError: on a scan without labels.
         """
-        count = len(NAMES)
-        table = np.zeros(count * count, np.int64)
+        table = np.zeros((len(NAMES), len(NAMES)), np.int64)
         for scan in scans:
-            if scan.label is None:
-                raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
+            require_label(scan)
             image, label = self.image(scan)
-            valid = label != IGNORE
-            pairs = label[valid].astype(np.int64) * count + self.predict(image)[valid]
-            table += np.bincount(pairs, minlength=len(table))
-        return table.reshape(count, count)
+            table += tabulate(label, self.predict(image))
+        return table
 
     def predict(self, image: Tensor) -> NDArray[np.uint8]:
         """Train ids (H, W) of an ``image`` (5, H, W); "unlabelled" is never predicted."""

@@ -17,6 +17,8 @@ from lidar_synth.errors import ConfigError, DataError, ProcessError
 from lidar_synth.files.disk import read_values, write_file
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.lab.evaluate.labels import require_label
+from lidar_synth.lab.evaluate.segmentation import tabulate
 from lidar_synth.lab.proof.arms import REAL, ArmStage, options_of
 from lidar_synth.lab.proof.trial import Job
 
@@ -139,18 +141,12 @@ def _read(path: Path, count: int) -> NDArray[np.uint8]:
 
 def _table(scans: Sequence[Scan], folder: Path, first: int) -> NDArray[np.int64]:
     """The table of the predictions from this number on."""
-    count = len(NAMES)
-    table = np.zeros((count, count), np.int64)
+    table = np.zeros((len(NAMES), len(NAMES)), np.int64)
     for index, scan in enumerate(scans, first):
-        assert scan.label is not None
+        label = require_label(scan)
         predicted = _read(folder / f"{index:06d}.label", len(scan))
-        valid = scan.label != IGNORE
         # A return without a prediction is an error: it counts as a class with which its own is
         # never pooled.
-        wrong = np.where(
-            scan.label == TRAIN_ID["road"], TRAIN_ID["car"], TRAIN_ID["road"]
-        )
-        given = np.where(predicted == IGNORE, wrong, predicted)
-        pairs = scan.label[valid].astype(np.int64) * count + given[valid]
-        table += np.bincount(pairs, minlength=count * count).reshape(count, count)
+        wrong = np.where(label == TRAIN_ID["road"], TRAIN_ID["car"], TRAIN_ID["road"])
+        table += tabulate(label, np.where(predicted == IGNORE, wrong, predicted))
     return table
