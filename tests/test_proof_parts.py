@@ -14,7 +14,6 @@ import torch.nn.functional as F
 import yaml
 from conftest import random_scan
 from proofs import SENSOR, Scans, drives, job
-from scipy import stats
 from streets import street
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
@@ -44,7 +43,6 @@ from lidar_synth.lab.proof.scores import (
     groups_of,
     interval,
     require_labels,
-    t_quantile,
 )
 from lidar_synth.lab.proof.trial import reference, run_trainer, turn_scan
 from lidar_synth.lab.town import Town
@@ -252,13 +250,6 @@ def test_pooled_classes_forgive_confusions_within_a_pool_and_no_others() -> None
         zip(GROUPS["pandaset"], group_ious(table, GROUPS["pandaset"]), strict=True)
     )
     assert ious["vehicle"] == 1 and ious["road"] == 0.5 and np.isnan(ious["building"])
-
-
-@pytest.mark.parametrize("degrees", [1, 4, 6, 30])
-def test_the_quantile_of_t_is_that_of_scipy(degrees: int) -> None:
-    assert t_quantile(0.975, degrees) == pytest.approx(
-        stats.t.ppf(0.975, degrees), rel=1e-3
-    )
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,10 @@ places and seeds."""
 
 from collections.abc import Mapping, Sequence
 from math import sqrt
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, stdtrit
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError, choose, suggest
@@ -138,7 +138,6 @@ def mean_group_iou(table: NDArray[np.int64], groups: Groups) -> float:
 
 def interval(
     differences: NDArray[np.float64],
-    level: float = 0.95,
     seed: int = 0,
     draws: int = DRAWS,
     shared: bool = False,
@@ -152,7 +151,6 @@ def interval(
 
     Args:
         differences: (P, S) of every place and seed; NaN where there is none.
-        level: the share of such intervals that holds the true mean.
         seed: of the draws.
         draws: their number.
         shared: whether the training of a seed is tested in all places; then each draw has the same
@@ -182,18 +180,6 @@ def interval(
         if not shared:
             order = rng.permutation(draws)
         totals += means[order, drawn[:, column]]
-    tail = NormalDist().cdf(
-        -sqrt(count / (count - 1)) * t_quantile((1 + level) / 2, count - 1)
-    )
+    tail = ndtr(-sqrt(count / (count - 1)) * stdtrit(count - 1, 0.975))
     low, high = np.quantile(totals / count, (tail, 1 - tail))
     return float(low), float(high)
-
-
-def t_quantile(share: float, degrees: int) -> float:
-    """The quantile of Student's t distribution, by bisection of its integral; 0.5 <= share < 1."""
-    grid = np.linspace(0, np.pi / 2, 20_001)[:-1]
-    # With t = sqrt(n) tan(a) the density is proportional to cos(a) ** (n - 1).
-    density = np.cos(grid) ** (degrees - 1)
-    area = np.concatenate([[0], np.cumsum((density[1:] + density[:-1]) / 2)])
-    angle = np.interp((share - 0.5) * 2, area / area[-1], grid)
-    return float(sqrt(degrees) * np.tan(angle))
