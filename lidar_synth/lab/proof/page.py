@@ -1,9 +1,9 @@
 """The page of a comparison: one HTML file that needs no network, for a reader who decides and does
 not train."""
 
-import html
 import re
 from collections.abc import Mapping, Sequence
+from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,9 @@ from typing import Any
 from lidar_synth.files.disk import write_file
 from lidar_synth.lab.proof.arms import BASE
 from lidar_synth.lab.proof.drawing import curves, differences
-from lidar_synth.lab.proof.summary import Proof, format_signed, span
+from lidar_synth.lab.proof.summary import format_signed, span
 
 Values = Mapping[str, Any]
-
-
-def write_page(path: Path, proof: Proof) -> None:
-    """Write the page of a comparison.
-
-    Raises:
-        FileError: if it cannot be written.
-    """
-    write_body(path, body(proof.values))
 
 
 def write_body(path: Path, content: str) -> None:
@@ -39,10 +30,10 @@ def write_body(path: Path, content: str) -> None:
 
 def body(values: Values) -> str:
     """The HTML of the page's content."""
-    first, _, rest = _sentences(values["headline"])
+    first, *rest = re.split(r"(?<=\.) (?=[A-Z])", values["headline"], maxsplit=1)
     parts = [
         f'<p class="headline">{escape(first)}</p>',
-        f'<p class="more">{escape(rest)}</p>' if rest else "",
+        *(f'<p class="more">{escape(text)}</p>' for text in rest),
         f"<p>{escape(what_was_done(values))}</p>",
         make_section(
             "Change of the mIoU against real scans only",
@@ -122,14 +113,6 @@ def protocol(values: Values) -> list[str]:
     ]
 
 
-def _sentences(text: str) -> tuple[str, str, str]:
-    """The first sentence of a text, and the rest."""
-    match = re.search(r"\. (?=[A-Z])", text)
-    if match is None:
-        return (text, "", "")
-    return (text[: match.start() + 1], " ", text[match.end() :])
-
-
 def _table(values: Values) -> str:
     head = (
         "training",
@@ -167,10 +150,8 @@ def _classes(values: Values) -> str:
     arms = values["arms"]
     rows = []
     for name in arms[0]["iou"]:
-        cells = [make_cell(name)] + [
-            make_cell("–" if (v := row["iou"][name]) is None else f"{v:.1f}")
-            for row in arms
-        ]
+        cells = [make_cell(name)]
+        cells += [make_cell(format_number(row["iou"][name])) for row in arms]
         rows.append(f"<tr>{''.join(cells)}</tr>")
     return make_grid(["class", *(row["title"] for row in arms)], rows)
 
@@ -180,13 +161,18 @@ def _places(values: Values) -> str:
     base = values["arms"][0]
     rows = []
     for place in values["tested_places"]:
-        miou = base["miou_by_place"][place]
-        cells = [make_cell(place), make_cell("–" if miou is None else f"{miou:.1f}")]
+        miou = format_number(base["miou_by_place"][place])
+        cells = [make_cell(place), make_cell(miou)]
         cells += [make_cell(format_signed(row["by_place"][place])) for row in arms]
         rows.append(f"<tr>{''.join(cells)}</tr>")
     return make_grid(
         ["place", f"{base['title']}, mIoU", *(row["title"] for row in arms)], rows
     )
+
+
+def format_number(value: float | None) -> str:
+    """A figure for a reader; – where there is none."""
+    return "–" if value is None else f"{value:.1f}"
 
 
 def make_grid(head: Sequence[str], rows: Sequence[str]) -> str:
@@ -223,8 +209,3 @@ def _sign(row: Values) -> str:
     if ends is None or ends[0] <= 0 <= ends[1]:
         return ""
     return "plus" if ends[0] > 0 else "minus"
-
-
-def escape(text: str) -> str:
-    """A text as HTML."""
-    return html.escape(text)

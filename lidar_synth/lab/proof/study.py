@@ -26,7 +26,7 @@ from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.evaluate.leakage import refuse_leaks
 from lidar_synth.lab.proof.arms import Row
 from lidar_synth.lab.proof.beams import keep_beams
-from lidar_synth.lab.proof.page import write_page
+from lidar_synth.lab.proof.page import body, write_body
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.planning import locate, make_plan
 from lidar_synth.lab.proof.pools import (
@@ -277,7 +277,7 @@ def report(work: Trainings, trainer: str, seen: str = "") -> Proof:
     costs = {row.key: _preparation(work, row) for row in plan.rows}
     proof = summarise(plan, found, costs, trainer, seen)
     write_file(work.out / RESULTS, (json.dumps(proof.values, indent=1) + "\n").encode())
-    write_page(work.out / PAGE, proof)
+    write_body(work.out / PAGE, body(proof.values))
     return proof
 
 

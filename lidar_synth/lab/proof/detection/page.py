@@ -1,12 +1,13 @@
 """The page of a comparison of detectors, and its table as text."""
 
 from collections.abc import Mapping
+from html import escape
 from typing import Any
 
 from lidar_synth.lab.proof.detection.summary import CRITERIA, MAIN
 from lidar_synth.lab.proof.drawing import differences
 from lidar_synth.lab.proof.page import (
-    escape,
+    format_number,
     make_cell,
     make_grid,
     make_list,
@@ -71,7 +72,7 @@ def _table(rows: list[dict[str, Any]]) -> str:
     made = []
     for row in rows:
         cells = [make_cell(row["title"])]
-        cells += [make_cell(_number(row[name])) for name in CRITERIA]
+        cells += [make_cell(format_number(row[name])) for name in CRITERIA]
         made.append(f"<tr>{''.join(cells)}</tr>")
     return make_grid(["training", *CRITERIA], made)
 
@@ -80,7 +81,7 @@ def _places(rows: list[dict[str, Any]]) -> str:
     made = []
     for place in rows[0]["by_place"]:
         cells = [make_cell(place)]
-        cells += [make_cell(_number(row["by_place"][place])) for row in rows]
+        cells += [make_cell(format_number(row["by_place"][place])) for row in rows]
         made.append(f"<tr>{''.join(cells)}</tr>")
     return make_grid(["place", *(row["title"] for row in rows)], made)
 
@@ -92,10 +93,6 @@ def _changes(row: Values, base: Values) -> dict[str, float | None]:
         place: None if value is None else value - there[place]
         for place, value in row["by_place"].items()
     }
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.1f}"
 
 
 def format_table(values: Values) -> str:
@@ -111,8 +108,8 @@ def format_table(values: Values) -> str:
             row = found["arms"][arm["arm"]]
             cells = [
                 arm["title"],
-                ", ".join(map(_number, row["by_seed"])),
-                _number(row[MAIN]),
+                ", ".join(map(format_number, row["by_seed"])),
+                format_number(row[MAIN]),
                 format_signed(row["difference"]),
                 span(row["interval"]) if row["difference"] is not None else "",
             ]
