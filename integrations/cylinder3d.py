@@ -66,9 +66,7 @@ def register() -> Any:
                 settings = read_settings()
                 refuse_unlabelled(settings, "Cylinder3D")
                 self._ids = trainer_ids(self.learning_map, take_classes(settings), _IDS)
-                self.mixed = mix_for_trainer(
-                    len(self.im_idx), settings, lambda scan, rng: scan
-                )
+                self.mixed = mix_for_trainer(len(self.im_idx), settings)
 
         def set_epoch(self, epoch: int) -> None:
             """Set the epoch, also for workers."""

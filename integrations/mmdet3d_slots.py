@@ -89,9 +89,7 @@ class Folder:
         self.settings = {k: _by_epoch(v) for k, v in facts["settings"].items()}
         self.real = int(facts["real"])
         self.layout = LAYOUTS[facts.get("layout", "kitti")]
-        self.mixed = mix_for_trainer(
-            self.real, self.settings, lambda scan, rng: scan, True
-        )
+        self.mixed = mix_for_trainer(self.real, self.settings, weighs=True)
         self.slots = self.mixed.mixture.laps[0]
         self._view = (
             None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))

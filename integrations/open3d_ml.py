@@ -95,11 +95,8 @@ def _split_class(stock: Any) -> Any:
 
         def __init__(self, dataset: Any, split: str = "training") -> None:
             # First, because the base class makes a sampler, which reads the length.
-            self.mixed = mix_for_trainer(
-                len(dataset.get_split_list(split)),
-                dataset.mixture,
-                lambda scan, rng: scan,
-            )
+            real = len(dataset.get_split_list(split))
+            self.mixed = mix_for_trainer(real, dataset.mixture)
             super().__init__(dataset, split=split)
 
         def set_epoch(self, epoch: int) -> None:

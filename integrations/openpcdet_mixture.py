@@ -42,9 +42,7 @@ class MixedDetection:
         settings = read_settings(self.dataset_cfg.get("LIDAR_SYNTH", None))
         real: int = super().__len__()  # type: ignore[misc]
         self.weighed = KEY in settings
-        self.mixed = mix_for_trainer(
-            real, settings, lambda scan, rng: scan, weighs=True
-        )
+        self.mixed = mix_for_trainer(real, settings, weighs=True)
         self._check_boxes({*self.class_names, *known})
 
     def merge_all_iters_to_one_epoch(

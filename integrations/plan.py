@@ -85,7 +85,7 @@ def write_plan(
             "a bank",
             "lidar-synth bake OUT writes one.",
         )
-    mixed = mix_for_trainer(real, settings, lambda scan, rng: scan)
+    mixed = mix_for_trainer(real, settings)
     if (
         "boxes" in mixed.synthetic[0].fields
         and labels != "none"

@@ -86,9 +86,7 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
         self._ids = trainer_ids(
             self.learning_map, taxonomy, id_table(0, self.ignore_index, np.int32)
         )
-        self.mixed = mix_for_trainer(
-            len(self.data_list), settings, lambda scan, rng: scan
-        )
+        self.mixed = mix_for_trainer(len(self.data_list), settings)
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, also for workers, persistent ones included."""

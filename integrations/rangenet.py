@@ -93,9 +93,7 @@ def dataset_class(stock: Any) -> Any:
             settings = dict(settings)
             self.taxonomy = take_classes(settings)
             _check_classes(self.learning_map, self.learning_map_inv, self.taxonomy)
-            self.mixed = mix_for_trainer(
-                len(self.scan_files), settings, lambda scan, rng: scan
-            )
+            self.mixed = mix_for_trainer(len(self.scan_files), settings)
             check_stripes(self)
 
         def set_epoch(self, epoch: int) -> None:

@@ -59,9 +59,7 @@ def dataset_class(stock: Any) -> Any:
                 refuse_unlabelled(settings, "WaffleIron")
                 require_ids(self.learning_map, _FILE_IDS)
                 self.real = copy(self)
-                self.mixed = mix_for_trainer(
-                    len(self.real), settings, lambda scan, rng: scan
-                )
+                self.mixed = mix_for_trainer(len(self.real), settings)
                 self.set_epoch(0)
 
         def set_epoch(self, epoch: int) -> None:

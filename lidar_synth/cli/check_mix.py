@@ -63,7 +63,7 @@ def check_mix(
     settings = read_settings(mix) | {"ratio": 0.5}
     # Ids of the trainer's files; here both kinds have train ids.
     settings.pop("classes", None)
-    mixture = make_mixture(len(source), settings, lambda scan, rng: scan, weighs=True)
+    mixture = make_mixture(len(source), settings, weighs=True)
     chosen = [i for i in range(len(mixture)) if mixture.domain(i)][:count]
     kinds: list[list[Scan]] = [
         [source[i] for i in spread(len(source), count)],

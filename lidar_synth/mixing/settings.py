@@ -217,7 +217,7 @@ def _open_real(where: Any) -> Any:
 def mix_for_trainer(
     real: int,
     settings: Mapping[str, Any],
-    to_sample: Callable[[Scan, np.random.Generator], Any],
+    to_sample: Callable[[Scan, np.random.Generator], Any] = lambda scan, rng: scan,
     weighs: bool = False,
 ) -> MixedScans:
     """Make a mixture from settings, for a trainer that loads real samples itself.
@@ -226,7 +226,7 @@ def mix_for_trainer(
         real: number of the trainer's real samples.
         settings: keys of ``OPTIONS``; ``synthetic`` is required. ``epochs`` are those of the
             trainer, and take the place of ``ratio``, see ``MixedScans.wrap``.
-        to_sample: ``(scan, rng) -> sample`` for synthetic scans.
+        to_sample: ``(scan, rng) -> sample`` for synthetic scans; by default they stay as they are.
         weighs: whether the trainer multiplies losses by ``loss_weight``.
 
     Returns:
