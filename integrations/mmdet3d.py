@@ -25,7 +25,7 @@ from lidar_synth.integrations.detection import check_names, ground_plane
 from lidar_synth.integrations.mixture import id_table, inner, require_ids
 from lidar_synth.integrations.mmdet3d_slots import (
     PREFIX,
-    Folder,
+    SlotFolder,
     draw_in_epoch,
     is_mixed,
     open_folder,
@@ -301,7 +301,7 @@ class SynthEpochHook(Hook):  # type: ignore[misc]
         self._resumes = False
 
 
-def _checked(dataset: Any) -> list[Folder]:
+def _checked(dataset: Any) -> list[SlotFolder]:
     """The folders of a dataset's mixed lists.
 
     Raises:

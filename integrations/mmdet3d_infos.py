@@ -23,7 +23,7 @@ from lidar_synth.integrations.mmdet3d_slots import (
     LAYOUTS,
     MIXTURE,
     PREFIX,
-    Folder,
+    SlotFolder,
     open_folder,
     require_boxes,
 )
@@ -102,7 +102,7 @@ def write_infos(
     }
     facts["layout"] = _layout(given, entries[0], layout, real)
     facts["view"] = None if view is False else camera
-    folder = Folder(out, facts)
+    folder = SlotFolder(out, facts)
     if detects and folder.slots:
         require_boxes(folder.scan(0))
         check_names(folder.scan(0), folder.layout.classes)

@@ -70,7 +70,7 @@ LAYOUTS = {
 }
 
 
-class Folder:
+class SlotFolder:
     """The slots of a mixed list.
 
     Args:
@@ -99,7 +99,7 @@ class Folder:
         self._epoch: int | None = None
 
     @classmethod
-    def open(cls, path: Path) -> "Folder":
+    def open(cls, path: Path) -> "SlotFolder":
         """Open a folder of ``write_infos``.
 
         Raises:
@@ -196,8 +196,8 @@ def _by_epoch(value: Any) -> Any:
     return {int(k) if str(k).isdigit() else k: v for k, v in value.items()}
 
 
-open_folder = cache(Folder.open)
-"""``Folder.open``, once per process and folder."""
+open_folder = cache(SlotFolder.open)
+"""``SlotFolder.open``, once per process and folder."""
 
 
 class EpochEntries:
@@ -209,7 +209,7 @@ class EpochEntries:
         folder: of the list.
     """
 
-    def __init__(self, dataset: Any, folder: Folder) -> None:
+    def __init__(self, dataset: Any, folder: SlotFolder) -> None:
         self.dataset = dataset
         self.folder = folder
 

@@ -15,7 +15,7 @@ from lidar_synth.integrations.detection import write_gt_database
 from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
 from lidar_synth.integrations.mmdet3d_slots import (
-    Folder,
+    SlotFolder,
     draw_in_epoch,
     open_folder,
     read_url,
@@ -299,7 +299,7 @@ def test_two_runs_that_share_a_list_have_their_own_epochs(
     write_infos(
         tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk"
     )
-    runs = Folder.open(tmp_path / "m"), Folder.open(tmp_path / "m")
+    runs = SlotFolder.open(tmp_path / "m"), SlotFolder.open(tmp_path / "m")
     before = {path: path.read_bytes() for path in (tmp_path / "m").iterdir()}
     runs[0].epoch = 0
     runs[1].epoch = 1
@@ -315,8 +315,8 @@ def test_a_list_may_begin_with_real_scans_alone(scans: Path, tmp_path: Path) -> 
     )
     settings = {"synthetic": scans, "ratio": {0: 0.0, 2: 0.5}}
     write_infos(tmp_path / "m", real, settings, data_root=tmp_path / "sk")
-    early = Folder.open(tmp_path / "m")
-    late = Folder.open(tmp_path / "m")
+    early = SlotFolder.open(tmp_path / "m")
+    late = SlotFolder.open(tmp_path / "m")
     late.epoch = 2
     assert early.slots == REAL
     for slot in range(REAL):
@@ -398,12 +398,12 @@ def test_lists_of_the_first_format_stay_readable(scans: Path, tmp_path: Path) ->
     (tmp_path / "m" / "mixture.json").write_text(
         json.dumps(facts | {"format": "lidar-synth-mmdet3d/1"})
     )
-    assert Folder.open(tmp_path / "m").layout.features == 4
+    assert SlotFolder.open(tmp_path / "m").layout.features == 4
     (tmp_path / "m" / "mixture.json").write_text(
         json.dumps(facts | {"format": "lidar-synth-mmdet3d/3"})
     )
     with pytest.raises(DataError, match="mmdet3d/3.*Write the list again"):
-        Folder.open(tmp_path / "m")
+        SlotFolder.open(tmp_path / "m")
 
 
 def test_objects_in_nuscenes_form(scans: Path, tmp_path: Path) -> None:
