@@ -14,11 +14,6 @@ import torch
 from mmengine.config import ConfigDict
 from mmengine.logging import HistoryBuffer
 
-try:
-    from numpy._core import multiarray
-except ImportError:  # numpy 1
-    from numpy.core import multiarray  # type: ignore[no-redef]
-
 
 def method_of_history(owner: Any, name: str) -> Callable[..., Any]:
     """A method of ``HistoryBuffer``, in the place of ``getattr``, by which a pickle names it.
@@ -40,9 +35,9 @@ def allow_checkpoints() -> None:
     if not hasattr(torch.serialization, "get_unsafe_globals_in_checkpoint"):
         return
     dtypes = {type(np.dtype(kind)) for kind in ("?", "i4", "i8", "f4", "f8")}
-    names = (
-        multiarray.scalar,
-        multiarray._reconstruct,
+    names: tuple[Any, ...] = (
+        np.float64(0).__reduce__()[0],
+        np.zeros(0).__reduce__()[0],
         np.ndarray,
         np.dtype,
         ConfigDict,

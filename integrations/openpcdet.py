@@ -13,8 +13,6 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import Any
 
-import numpy as np
-import torch
 from lidar_synth.integrations.launcher import prepare_script, run
 from lidar_synth.integrations.weights import weigh_openpcdet
 from torch.utils.data import Sampler, SequentialSampler
@@ -117,27 +115,15 @@ def tell_epochs() -> None:
     loop.train_one_epoch = train_one_epoch
 
 
-def read_checkpoints() -> None:
-    """Let torch read the learning rates in OpenPCDet's checkpoints, which are numbers of numpy.
-
-    From torch 2.6 on, ``torch.load`` refuses them by default, and OpenPCDet, which then takes an
-    older checkpoint or none, trains from the beginning again instead of resuming.
-    """
-    if hasattr(torch.serialization, "add_safe_globals"):  # from torch 2.4 on
-        kinds = [np.dtype(kind) for kind in (np.float64, np.float32, np.int64)]
-        scalar: Any = np.float64(0).__reduce__()[0]
-        torch.serialization.add_safe_globals([scalar, np.dtype, *map(type, kinds)])
-
-
 def main() -> None:
     """Run one of OpenPCDet's scripts with the datasets registered: ``train.py`` or ``test.py`` and
     its arguments."""
     script = prepare_script(
-        "cd OpenPCDet/tools; python -m lidar_synth.integrations.openpcdet train.py ARGUMENTS"
+        "cd OpenPCDet/tools; python -m lidar_synth.integrations.openpcdet train.py ARGUMENTS",
+        "torch.load",  # else it trains from the beginning again instead of resuming
     )
     register()
     tell_epochs()
-    read_checkpoints()
     run(script)
 
 
