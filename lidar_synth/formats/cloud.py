@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import SKIP_HINT
+from lidar_synth.formats.npz import TYPES
 from lidar_synth.geometry.scan import Scan
 
 STORED = {
@@ -34,16 +35,6 @@ STORED = {
     "cause": "<u1",
 }
 """Type on disk of each field of a scan except reflectance."""
-
-IN_MEMORY = {
-    "label": "u1",
-    "raw_label": "u4",
-    "instance": "i4",
-    "ring": "i2",
-    "confidence": "f4",
-    "time": "f4",
-    "cause": "u1",
-}
 
 REFLECTANCES = ("reflectivity", "intensity", "reflectance", "remission", "i")
 RINGS = ("ring", "channel")
@@ -236,7 +227,7 @@ def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         if n in stored and stored[n].dtype.newbyteorder("<") == np.dtype(kind)
     ]
     arrays = {"points": points, **reflectance} | {
-        n: stored[n].astype(IN_MEMORY[n]) for n in own
+        n: stored[n].astype(TYPES[n]) for n in own
     }
     ring = _first(stored, RINGS)
     time = _first(stored, TIMES)
