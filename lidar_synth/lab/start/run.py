@@ -250,7 +250,9 @@ def start(
     task = _task(found, task)
     if task == "detection" and isinstance(found.source, CameraBoxes):
         found = replace(found, source=found.source.with_boxes())
-    plan = _plan(found, task, out, scans, minutes, jobs or usable_cores())
+    cast = task == "detection" or _blind(found.source.sensor) > BLIND
+    jobs = jobs or usable_cores()
+    plan = StartPlan(found, task, cast, out, scans, minutes, jobs)
     if trainer is not None:
         _configure(plan, trainer)  # complains before anything is made
     lines = (*found.lines(), plan.line())
@@ -286,18 +288,6 @@ def _task(found: Findings, given: str | None) -> str:
             or f"labels, which {found.labelled} of {found.looked} scans looked at have",
         )
     return given
-
-
-def _plan(
-    found: Findings,
-    task: str,
-    out: Path,
-    scans: int,
-    minutes: float,
-    jobs: int,
-) -> StartPlan:
-    cast = task == "detection" or _blind(found.source.sensor) > BLIND
-    return StartPlan(found, task, cast, out, scans, minutes, jobs)
 
 
 def _model_sensor() -> Sensor:
