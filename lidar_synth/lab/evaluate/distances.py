@@ -4,6 +4,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import rel_entr
 
 from lidar_synth.errors import DataError
 
@@ -29,11 +30,7 @@ def jensen_shannon_distance(p: NDArray[np.number], q: NDArray[np.number]) -> flo
     p = p.ravel() / p.sum()
     q = q.ravel() / q.sum()
     mean = (p + q) / 2
-    total = 0.0
-    for weights in (p, q):
-        held = weights > 0
-        kept = weights[held]
-        total += float((kept * np.log(kept / mean[held])).sum())
+    total = rel_entr(p, mean).sum() + rel_entr(q, mean).sum()
     return float(np.sqrt(max(total / 2, 0.0)))
 
 
