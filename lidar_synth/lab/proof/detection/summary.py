@@ -81,44 +81,28 @@ def _of_class(
     each: int,
 ) -> dict[str, Any]:
     """{arm: its figures} for one class."""
-    base = _groups(
-        found[BASE],
-        truths,
-        tested,
-        each,
-        CRITERIA[MAIN],
-    )
+    judged = {
+        arm: {
+            name: _groups(outcomes, truths, tested, each, criterion)
+            for name, criterion in CRITERIA.items()
+        }
+        for arm, outcomes in found.items()
+    }
+    base = judged[BASE][MAIN]
     table = {}
-    for arm, outcomes in found.items():
-        own = _groups(
-            outcomes,
-            truths,
-            tested,
-            each,
-            CRITERIA[MAIN],
-        )
+    for arm, groups in judged.items():
+        own = groups[MAIN]
         changes = [_percent(a) - _percent(b) for a, b in zip(own, base, strict=True)]
         by_place = _by_place(own, tested)
-        judged = sum(value is not None for value in by_place.values())
+        places = sum(value is not None for value in by_place.values())
         other = arm != BASE
-        enough = other and judged >= FEWEST_PLACES
+        enough = other and places >= FEWEST_PLACES
         table[arm] = {
             "by_seed": [_mean([one]) for one in own],
             "difference": round(float(np.nanmean(changes)), 1) if other else None,
             "interval": interval_of(own, base) if enough else None,
             "by_place": by_place,
-            **{
-                name: _mean(
-                    _groups(
-                        outcomes,
-                        truths,
-                        tested,
-                        each,
-                        criterion,
-                    )
-                )
-                for name, criterion in CRITERIA.items()
-            },
+            **{name: _mean(one) for name, one in groups.items()},
         }
     wanted = [sum(one.wanted for place in seed for one in place) for seed in base]
     return {"boxes": wanted, "arms": table}
