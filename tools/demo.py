@@ -32,7 +32,7 @@ from typer import Argument, run
 from lidar_synth import Bank, Scan, Source, load_sensor, mix, open_scans, sample_scans
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.files.disk import write_file
-from lidar_synth.geometry.scan import REAL, SYNTHETIC
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, spread
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels import edit
 from lidar_synth.viz import html_page
@@ -75,11 +75,9 @@ def command(*words: str) -> None:
     subprocess.run([sys.executable, "-m", "lidar_synth", *words], check=True)
 
 
-def spread(source: Source, count: int) -> list[Scan]:
+def some(source: Source, count: int) -> list[Scan]:
     """At most ``count`` scans, evenly spread over a source."""
-    last = len(source) - 1
-    places = np.linspace(0, last, min(count, len(source))).round().astype(int)
-    return [source[int(i)] for i in places]
+    return [source[i] for i in spread(range(len(source)), count)]
 
 
 def dataset(scans: int) -> Data:
@@ -89,7 +87,7 @@ def dataset(scans: int) -> Data:
         ("KITTI360_ROOT", "kitti360", "KITTI-360"),
     ):
         if root := os.environ.get(variable):
-            real = spread(open_scans(root, layout=layout), scans)
+            real = some(open_scans(root, layout=layout), scans)
             return Data(real, f"Recorded scan ({title})", f"Recorded scans: {title}.")
     notes = (
         "The recorded scans are those that ship with the package. Set SEMANTICKITTI_ROOT to see "
@@ -158,12 +156,9 @@ def panels(data: Data, bank: Bank) -> list[str]:
 
 def write_page(path: Path, data: Data, bank: Bank, town: Source) -> None:
     """Write the page."""
-    cast = [replace(scan, domain=SYNTHETIC) for scan in spread(town, SHOWN)]
+    cast = [replace(scan, domain=SYNTHETIC) for scan in some(town, SHOWN)]
     text = html_page(
-        spread(data.real, SHOWN)
-        + spread(bank, SHOWN)
-        + cast
-        + change(sample_scans()[0]),
+        some(data.real, SHOWN) + some(bank, SHOWN) + cast + change(sample_scans()[0]),
         title="Real, synthetic and changed scans",
         notes=f"{data.notes} {_SYNTHETIC}\n\n{_RECORDED}",
         domains=(data.name, "Synthetic scan"),

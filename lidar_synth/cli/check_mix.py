@@ -45,12 +45,12 @@ def check_mix(
       lidar-synth check-mix mix.yaml kitti/ --out mix.png
     """
     from lidar_synth.formats import open_scans
+    from lidar_synth.geometry.scan import spread
     from lidar_synth.mixing.compare import USUAL_IGNORE, report
     from lidar_synth.mixing.meaning import (
         contradictions,
         measure_tables,
         rows_in_use,
-        spread,
         table_of,
     )
     from lidar_synth.mixing.settings import mix_for_trainer as make_mixture
@@ -66,7 +66,7 @@ def check_mix(
     mixture = make_mixture(len(source), settings, weighs=True)
     chosen = [i for i in range(len(mixture)) if mixture.domain(i)][:count]
     kinds: list[list[Scan]] = [
-        [source[i] for i in spread(len(source), count)],
+        [source[i] for i in spread(range(len(source)), count)],
         [mixture[i] for i in chosen],
     ]
     theirs, ours = (

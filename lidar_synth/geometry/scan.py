@@ -5,7 +5,7 @@ All of them are in the sensor frame: right-handed, x forward, y left, z up, metr
 """
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sized
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -396,6 +396,13 @@ class Source(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int, /) -> Scan: ...
+
+
+def spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the indices, evenly spread."""
+    count = min(count, len(indices))
+    picks = np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int))
+    return [indices[i] for i in picks]
 
 
 def identity_of(source: Any) -> str:

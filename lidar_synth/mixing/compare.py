@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, spread
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing.meaning import (
     Contradiction,
     Table,
     contradictions,
     measure_tables,
-    spread,
 )
 from lidar_synth.mixing.synthetic import Synthetic
 from lidar_synth.noise import keyed_rng
@@ -127,11 +126,12 @@ def _compare_more(
 ) -> None:
     """Compare what several samples of a dataset and of a source mean."""
     real = [
-        _try("real", dataset.__getitem__, i) for i in spread(len(dataset), SEARCHED)[1:]
+        _try("real", dataset.__getitem__, i)
+        for i in spread(range(len(dataset)), SEARCHED)[1:]
     ]
     synthetic = [
         _try("synthetic", lambda i: make(source[i], keyed_rng(i)), i)
-        for i in spread(source.length or SEARCHED, SEARCHED)
+        for i in spread(range(source.length or SEARCHED), SEARCHED)
     ]
     report(
         compare_meaning(

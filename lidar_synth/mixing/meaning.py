@@ -20,9 +20,6 @@ from lidar_synth.geometry.scan import Scan
 
 Floats = NDArray[np.float64]
 
-LEAST_POINTS = 500
-"""Minimum number of rows of an array whose distribution is compared."""
-
 LOOKED_AT = 15_000
 """About the number of rows of a sample that are looked at."""
 
@@ -135,13 +132,6 @@ def table_of(scan: Scan) -> Table:
     return Table(
         columns, None if scan.label is None else scan.label.astype(np.int64), True
     )
-
-
-def spread(length: int, count: int) -> list[int]:
-    """Up to ``count`` indices from the first to the last of a source."""
-    if length:
-        return sorted({int(index) for index in np.linspace(0, length - 1, count)})
-    return []
 
 
 def rows_in_use(scans: Sequence[Scan]) -> int:

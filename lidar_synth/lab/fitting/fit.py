@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.lines import Cloud, Model, nearest_beams, residuals
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry.scan import Scan, Source, spread
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.azimuths import Azimuths, fit_azimuths, turn_of
 from lidar_synth.lab.fitting.beams import (
@@ -22,7 +22,6 @@ from lidar_synth.lab.fitting.beams import (
 )
 from lidar_synth.lab.fitting.doubts import doubts, name_vendor
 from lidar_synth.lab.fitting.limits import range_limits, range_step, reflectance_levels
-from lidar_synth.lab.spread import spread
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.deskew import rotate
 from lidar_synth.geometry.lines import CAP, Cloud, Model, nearest_beams, residuals
-from lidar_synth.lab.spread import spread
+from lidar_synth.geometry.scan import spread
 
 Floats = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import layout_of
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.generate.devices import check_device
-from lidar_synth.geometry.scan import LABELLED_ONLY, Scan, Source
+from lidar_synth.geometry.scan import LABELLED_ONLY, Scan, Source, spread
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.leakage import content_of, recordings_of
 from lidar_synth.lab.proof.arms import rows
@@ -29,7 +29,6 @@ from lidar_synth.lab.proof.places import (
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.scores import GROUPS, groups_of, require_labels
 from lidar_synth.lab.proof.settings import MOST_LABELLED, ProofSettings
-from lidar_synth.lab.spread import spread
 from lidar_synth.labels.exchange import thin_scan
 from lidar_synth.mixing.sources import sensor_of
 

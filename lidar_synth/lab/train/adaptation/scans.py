@@ -26,10 +26,9 @@ from lidar_synth.generate.codec import Latent
 from lidar_synth.geometry.agreement import MOST_OUTSIDE, agreement
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.scan import RangeImage, Scan, spread
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.leakage import content_of, contents, recordings_of
-from lidar_synth.lab.spread import spread
 
 FEWEST = 12
 MOST = 200
