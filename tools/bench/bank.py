@@ -28,7 +28,7 @@ import h5py
 import numpy as np
 import torch
 from projection import random_points, read
-from timing import machine, print_table, time_in_turns
+from timing import machine, print_table, seconds, time_in_turns
 from tqdm import tqdm
 from typer import Argument, run
 
@@ -107,13 +107,6 @@ def sizes(root: Path, images: list[RangeImage]) -> None:
         print(f"| {name} | {size / 1e3:.1f} kB a scan |")
 
 
-def seconds(call: Callable[[], object]) -> float:
-    """Processor time of one call, of all threads."""
-    start = time.process_time()
-    call()
-    return time.process_time() - start
-
-
 def scans_per_second(root: Path, images: list[RangeImage], threads: int) -> float:
     """Scans with confidence that one process writes per second of wall-clock time, with all its
     threads."""
@@ -138,7 +131,7 @@ def size_and_rate(root: Path, images: list[RangeImage]) -> Bank:
     sizes(root / "full", images)
     print(f"| step of the range | {plain.facts.encoding.scale * 1e3:.2f} mm |")
     print(f"| largest error of a range | {error * 1e3:.2f} mm |")
-    fastest = min(seconds(read) for _ in range(3))
+    fastest = min(seconds(read, time.process_time) for _ in range(3))
     print(f"| read in order, as images | {count / fastest:.0f} scans/s |")
     print_writing(root, images)
     return plain
@@ -148,7 +141,10 @@ def print_writing(root: Path, images: list[RangeImage]) -> None:
     """Prints the rates of writing."""
     for fields in (FIELDS[:2], FIELDS):
         took = [
-            seconds(partial(write, root / f"{len(fields)}-{turn}", images, fields))
+            seconds(
+                partial(write, root / f"{len(fields)}-{turn}", images, fields),
+                time.process_time,
+            )
             for turn in range(3)
         ]
         name = ", ".join(("range", *fields))
@@ -287,9 +283,9 @@ def random_reads(root: Path, shards: int, reads: int = 20_000) -> None:
         bank = Bank(root)
         before = peak_memory()
         firsts = range(0, count * LARGE, LARGE)
-        opened = seconds(partial(read_all, bank, firsts)) / count
+        opened = seconds(partial(read_all, bank, firsts), time.process_time) / count
         order = np.random.default_rng(0).integers(0, count * LARGE, reads).tolist()
-        later = seconds(partial(read_all, bank, order)) / reads
+        later = seconds(partial(read_all, bank, order), time.process_time) / reads
         base = base or later
         memory = peak_memory() - before
         print(

@@ -12,7 +12,7 @@ compressed by zstd at level 1, and a downloader for http, which it has not.
 
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -26,7 +26,7 @@ from urllib.request import urlopen
 
 import numpy as np
 from bank import FIELDS, town_images, write
-from timing import machine
+from timing import machine, seconds
 from typer import Option, run
 
 from lidar_synth.bank import Bank
@@ -122,13 +122,6 @@ def served(folder: Path, rate: float, delay: float) -> Iterator[str]:
     finally:
         process.kill()
         process.join()
-
-
-def seconds(call: Callable[[], object]) -> float:
-    """Wall-clock time of a call."""
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
 
 
 def download(urls: list[str]) -> None:

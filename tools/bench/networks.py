@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 from accelerate import Accelerator
-from timing import machine
+from timing import machine, seconds
 from torch import Tensor, nn
 from torch.profiler import ProfilerActivity, profile
 from tqdm import tqdm
@@ -73,13 +73,6 @@ def full_network(model: Path | None) -> Any:
         if parameter.ndim == 2 and not parameter.any():
             nn.init.trunc_normal_(parameter, std=0.02)
     return net.eval()
-
-
-def seconds(call: Callable[[], object]) -> float:
-    """Wall time of one call."""
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
 
 
 def on_cpu(net: Any, rounds: int) -> None:

@@ -16,6 +16,15 @@ CLOCKS = {
 """What is measured, and its clock, by whether the machine does other work."""
 
 
+def seconds(
+    call: Callable[[], object], clock: Callable[[], float] = time.perf_counter
+) -> float:
+    """Seconds that one call takes, of wall time by default."""
+    start = clock()
+    call()
+    return clock() - start
+
+
 def time_in_turns(
     calls: Mapping[str, Callable[[], object]],
     rounds: int = 60,
@@ -28,13 +37,11 @@ def time_in_turns(
     """
     for call in calls.values():
         call()
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    taken: dict[str, list[float]] = {name: [] for name in calls}
     for _ in tqdm(range(rounds), desc="timing", leave=False):
         for name, call in calls.items():
-            start = clock()
-            call()
-            seconds[name].append(clock() - start)
-    return {name: median(values) for name, values in seconds.items()}
+            taken[name].append(seconds(call, clock))
+    return {name: median(values) for name, values in taken.items()}
 
 
 def machine() -> str:
