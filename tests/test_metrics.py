@@ -98,7 +98,7 @@ def test_r2flow_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> 
 
 def test_lidm_cells(vectors: Vectors) -> None:
     counts = sum(
-        np.bincount(lidm.find_occupied(c, lidm.FINE), minlength=2000**2)
+        np.bincount(lidm.find_occupied(c, 0.05), minlength=2000**2)
         for c in clouds(vectors, "real")
     )
     assert np.array_equal(
@@ -107,7 +107,7 @@ def test_lidm_cells(vectors: Vectors) -> None:
     assert np.array_equal(counts[counts > 0], vectors["lidm/bev_sum_values"])
     coarse = (
         np.stack(
-            np.divmod(lidm.find_occupied(clouds(vectors, "real")[0], lidm.COARSE), 200),
+            np.divmod(lidm.find_occupied(clouds(vectors, "real")[0], 0.5), 200),
             1,
         )
         / 200

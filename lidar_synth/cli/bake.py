@@ -161,13 +161,13 @@ def _share(index: str, number: int | None) -> "Share":
     return Share(int(index), int(size))
 
 
-def _report_unboxed(bank: str, scans: int = 8) -> None:
+def _report_unboxed(bank: str) -> None:
     """Print how many objects of the first scans have no box, for those who train a detector."""
     from lidar_synth.bank import Bank
     from lidar_synth.labels.edit import measure
 
     opened = Bank(bank)
-    found = measure(opened[i] for i in range(min(scans, len(opened))))
+    found = measure(opened[i] for i in range(min(8, len(opened))))
     if found.objects:
         typer.echo(
             f"  {found}; a detector needs labels: paste, which removes them and pastes "

@@ -165,7 +165,6 @@ class ContextBlock(nn.Module):
         heads: number of heads, a divisor of the channels.
         context: channels of a context token.
         groups: groups of the norm.
-        ratio: hidden channels per channel.
     """
 
     def __init__(
@@ -174,7 +173,6 @@ class ContextBlock(nn.Module):
         heads: int,
         context: int,
         groups: int = GROUPS,
-        ratio: int = 4,
     ) -> None:
         super().__init__()
         self.heads = heads
@@ -187,8 +185,8 @@ class ContextBlock(nn.Module):
         self.query = nn.Linear(channels, channels, bias=False)
         self.key_value = nn.Linear(context, 2 * channels, bias=False)
         self.context_out = nn.Linear(channels, channels)
-        self.expand = nn.Linear(channels, 2 * ratio * channels)
-        self.contract = nn.Linear(ratio * channels, channels)
+        self.expand = nn.Linear(channels, 8 * channels)
+        self.contract = nn.Linear(4 * channels, channels)
         nn.init.zeros_(self.leave.weight)
         nn.init.zeros_(self.leave.bias)
 

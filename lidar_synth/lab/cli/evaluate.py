@@ -177,15 +177,15 @@ def evaluate(
         processes=processes,
         left_out=left_out,
     )
-    typer.echo(
-        json.dumps([asdict(s) for s in scores], indent=2)
-        if as_json
-        else "\n".join(map(str, scores))
-    )
+    _print([asdict(s) for s in scores], "\n".join(map(str, scores)), as_json)
     for note in filter(None, (describe_missing(left_out, rules), rules.unverified)):
         typer.echo(note, err=True)
     if beside and not as_json:
         typer.echo(f"\n{published(scores)}")
+
+
+def _print(figures: object, text: str, as_json: bool) -> None:
+    typer.echo(json.dumps(figures, indent=2) if as_json else text)
 
 
 def _objects(sources: "tuple[Source, Source]", as_json: bool) -> None:
@@ -193,7 +193,7 @@ def _objects(sources: "tuple[Source, Source]", as_json: bool) -> None:
     from lidar_synth.lab.evaluate.objects import as_text, compare_objects
 
     figures = compare_objects(*sources)
-    typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
+    _print(figures, as_text(figures), as_json)
 
 
 def _boxes(path: Path, sources: "tuple[Source, Source]", as_json: bool) -> None:
@@ -209,7 +209,7 @@ def _boxes(path: Path, sources: "tuple[Source, Source]", as_json: bool) -> None:
         name: recognise_boxes(network, source, name, not as_json)
         for source, name in zip(sources, ("real", "fake"), strict=True)
     }
-    typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
+    _print(figures, as_text(figures), as_json)
 
 
 def _recognition(
@@ -225,4 +225,4 @@ def _recognition(
         for s, name in zip(sources, ("real", "fake"), strict=True)
     )
     figures = compare(real, fake)
-    typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
+    _print(figures, as_text(figures), as_json)

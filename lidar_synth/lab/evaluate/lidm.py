@@ -16,11 +16,6 @@ from lidar_synth.geometry.sensor import Sensor
 HALF = 50
 """Half the side of the bird's-eye square around the sensor, metres."""
 
-FINE = 0.05
-COARSE = 0.5
-"""Size of cells in metres, for the Jensen-Shannon distance and for the minimum matching
-distance."""
-
 SENSOR = Sensor(
     "lidm",
     1024,

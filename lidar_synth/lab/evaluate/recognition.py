@@ -56,16 +56,14 @@ class Recognition:
         counts = self.isolated_counts[1]
         return {name: float(shares[i]) for i, name in enumerate(NAMES) if counts[i]}
 
-    def confusions(
-        self, name: str, most: int = 2, least: float = 0.05
-    ) -> list[tuple[str, float]]:
-        """The classes most often predicted instead of a class, with their share of its cells,
-        largest first."""
+    def confusions(self, name: str) -> list[tuple[str, float]]:
+        """The two classes most often predicted instead of a class, with their share of its cells
+        from 5 % on, largest first."""
         row = self.table[NAMES.index(name)] / max(
             1, self.table[NAMES.index(name)].sum()
         )
-        order = [i for i in np.argsort(-row) if NAMES[i] != name and row[i] >= least]
-        return [(NAMES[i], float(row[i])) for i in order[:most]]
+        order = [i for i in np.argsort(-row) if NAMES[i] != name and row[i] >= 0.05]
+        return [(NAMES[i], float(row[i])) for i in order[:2]]
 
 
 def recognise(

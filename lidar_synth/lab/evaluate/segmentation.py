@@ -50,7 +50,9 @@ def confusion(
 
 
 def tabulate(
-    label: NDArray[np.uint8], predicted: NDArray[np.integer], columns: int = len(NAMES)
+    label: NDArray[np.uint8],
+    predicted: NDArray[np.integer],
+    columns: int = len(NAMES),
 ) -> NDArray[np.int64]:
     """(19, columns) number of elements by label (row) and prediction (column), without ignored
     ones; the arrays have one shape."""

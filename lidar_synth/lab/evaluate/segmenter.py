@@ -59,7 +59,6 @@ class RangeSegmenter(nn.Module):
     """Predicts the class of every cell of a range image.
 
     Args:
-        in_channels: channels of the input; ``segmenter_input`` gives 4.
         classes: number of classes.
         widths: channels per level. Every level after the first halves the columns, and from the
             third on the rows too.
@@ -67,14 +66,13 @@ class RangeSegmenter(nn.Module):
 
     def __init__(
         self,
-        in_channels: int = 4,
         classes: int = len(NAMES),
         widths: tuple[int, ...] = (16, 32, 64, 96),
     ) -> None:
         super().__init__()
         widths = tuple(widths)
         self.strides = [(1, 2)] + [(2, 2)] * (len(widths) - 2)
-        self.stem = CircularConv(in_channels, widths[0])
+        self.stem = CircularConv(4, widths[0])
         self.down = nn.ModuleList(
             nn.Sequential(CircularConv(a, b, s), CircularConv(b, b))
             for (a, b), s in zip(pairwise(widths), self.strides, strict=True)
@@ -83,7 +81,7 @@ class RangeSegmenter(nn.Module):
         self.head = nn.Conv2d(widths[0], classes, 1)
 
     def decode(self, x: Tensor) -> Tensor:
-        """(B, in_channels, H, W) to the decoder's last feature map (B, widths[0], H, W)."""
+        """(B, 4, H, W) to the decoder's last feature map (B, widths[0], H, W)."""
         skips = [self.stem(x)]
         for level in self.down:
             skips.append(level(skips[-1]))
@@ -93,12 +91,12 @@ class RangeSegmenter(nn.Module):
         return x
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, in_channels, H, W) to logits (B, classes, H, W)."""
+        """(B, 4, H, W) to logits (B, classes, H, W)."""
         logits: Tensor = self.head(self.decode(x))
         return logits
 
     def features(self, x: Tensor) -> Tensor:
-        """(B, in_channels, H, W) to (B, ROW_BANDS * widths[0]) means of the decoder's last feature
+        """(B, 4, H, W) to (B, ROW_BANDS * widths[0]) means of the decoder's last feature
         map over bands of rows."""
         return F.adaptive_avg_pool2d(self.decode(x), (ROW_BANDS, 1)).flatten(1)
 

@@ -106,20 +106,19 @@ class Discriminator(nn.Module):
     Args:
         channels: of the images.
         width: channels of the first layer; each further one has twice as many.
-        depth: layers that halve the image.
     """
 
-    def __init__(self, channels: int, width: int, depth: int = 3) -> None:
+    def __init__(self, channels: int, width: int) -> None:
         super().__init__()
         layers: list[nn.Module] = []
-        for i in range(depth):
+        for i in range(3):
             inputs = channels if i == 0 else width << (i - 1)
             outputs = width << i
             layers.append(WrapConv(inputs, outputs, (4, 4), (2, 2), (1, 2, 1, 2)))
             if i:
                 layers.append(Norm(outputs, 1e-6))
             layers.append(nn.LeakyReLU(0.2))
-        self.layers = nn.Sequential(*layers, WrapConv(width << (depth - 1), 1))
+        self.layers = nn.Sequential(*layers, WrapConv(4 * width, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) to (B, 1, h, w)."""

@@ -14,6 +14,9 @@ from torch import Tensor, nn
 BLOCKS = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}
 """Residual blocks of each stage of the encoder, by the name of the network."""
 
+WIDTH = 32
+"""Channels of the first feature map."""
+
 
 class _DarknetResidual(nn.Module):
     def __init__(self, channels: int, between: int) -> None:
@@ -48,13 +51,13 @@ def _stage(
 
 
 class _DarknetEncoder(nn.Module):
-    def __init__(self, channels: int, layers: int, width: int) -> None:
+    def __init__(self, channels: int, layers: int) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(channels, width, 3, padding=1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
+        self.conv1 = nn.Conv2d(channels, WIDTH, 3, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(WIDTH)
         for i, count in enumerate(BLOCKS[layers]):
-            inputs = width << i
-            outputs = width << (i + 1)
+            inputs = WIDTH << i
+            outputs = WIDTH << (i + 1)
             conv = nn.Conv2d(inputs, outputs, 3, stride=(1, 2), padding=1, bias=False)
             self.add_module(
                 f"enc{i + 1}",
@@ -76,10 +79,10 @@ class _DarknetEncoder(nn.Module):
 
 
 class _DarknetDecoder(nn.Module):
-    def __init__(self, width: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
         for i, (inputs, outputs) in enumerate(
-            pairwise(width << j for j in (5, 4, 3, 2, 1, 0))
+            pairwise(WIDTH << j for j in (5, 4, 3, 2, 1, 0))
         ):
             conv = nn.ConvTranspose2d(
                 inputs, outputs, (1, 4), stride=(1, 2), padding=(0, 1)
@@ -89,7 +92,7 @@ class _DarknetDecoder(nn.Module):
             )
 
     def forward(self, maps: list[Tensor]) -> Tensor:
-        """The feature maps of the encoder to (B, width, H, W)."""
+        """The feature maps of the encoder to (B, WIDTH, H, W)."""
         *skips, x = maps
         for i in (5, 4, 3, 2, 1):
             x = self.get_submodule(f"dec{i}")(x) + skips.pop()
@@ -103,7 +106,6 @@ class RangeNet(nn.Module):
         channels: channels of the input.
         classes: number of classes, the unlabelled class included; 0 for a network without its head.
         layers: 21 or 53.
-        width: channels of the first feature map.
     """
 
     def __init__(
@@ -111,18 +113,17 @@ class RangeNet(nn.Module):
         channels: int = 5,
         classes: int = 20,
         layers: int = 53,
-        width: int = 32,
     ) -> None:
         super().__init__()
-        self.backbone = _DarknetEncoder(channels, layers, width)
-        self.segmentation_decoder = _DarknetDecoder(width)
+        self.backbone = _DarknetEncoder(channels, layers)
+        self.segmentation_decoder = _DarknetDecoder()
         if classes:
             self.segmentation_head = nn.Sequential(
-                nn.Identity(), nn.Conv2d(width, classes, 3, padding=1)
+                nn.Identity(), nn.Conv2d(WIDTH, classes, 3, padding=1)
             )
 
     def decode(self, x: Tensor) -> Tensor:
-        """(B, channels, H, W), W a multiple of 32, to the decoder's feature map (B, width, H,
+        """(B, channels, H, W), W a multiple of 32, to the decoder's feature map (B, WIDTH, H,
         W)."""
         features: Tensor = self.segmentation_decoder(self.backbone(x))
         return features

@@ -4,6 +4,7 @@ R2Flow's FPD.
 Its 1,808 features are the pooled vector and the three layers after it: 1,024, 512, 256 and 16.
 """
 
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -27,19 +28,16 @@ BLOCK = 8192
 
 
 class _Points(nn.Module):
-    """The layers that every point passes: 3, 64, 128, 1,024 channels (for ``widths`` of the
-    published network)."""
+    """The layers that every point passes."""
 
-    def __init__(self, widths: tuple[int, int, int]) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        for i, (inputs, outputs) in enumerate(
-            zip((3, *widths[:2]), widths, strict=True), 1
-        ):
+        for i, (inputs, outputs) in enumerate(pairwise((3, 64, 128, 1024)), 1):
             self.add_module(f"conv{i}", nn.Conv1d(inputs, outputs, 1))
             self.add_module(f"bn{i}", nn.BatchNorm1d(outputs))
 
     def pooled(self, points: Tensor) -> Tensor:
-        """(1, 3, N) to (1, widths[2]): the largest value of each feature over all points, before
+        """(1, 3, N) to (1, 1024): the largest value of each feature over all points, before
         the last ReLU."""
         best = [self._features(part).amax(2) for part in torch.split(points, BLOCK, 2)]
         return torch.stack(best).amax(0)
@@ -54,13 +52,13 @@ class _Points(nn.Module):
 class _Transform(_Points):
     """Predicts a 3 x 3 matrix for the cloud."""
 
-    def __init__(self, widths: tuple[int, int, int], hidden: tuple[int, int]) -> None:
-        super().__init__(widths)
-        self.fc1 = nn.Linear(widths[2], hidden[0])
-        self.fc2 = nn.Linear(*hidden)
-        self.fc3 = nn.Linear(hidden[1], 9)
-        self.bn4 = nn.BatchNorm1d(hidden[0])
-        self.bn5 = nn.BatchNorm1d(hidden[1])
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(1024, 512)
+        self.fc2 = nn.Linear(512, 256)
+        self.fc3 = nn.Linear(256, 9)
+        self.bn4 = nn.BatchNorm1d(512)
+        self.bn5 = nn.BatchNorm1d(256)
 
     def forward(self, points: Tensor) -> Tensor:
         """(1, 3, N) to (1, 3, 3)."""
@@ -71,37 +69,26 @@ class _Transform(_Points):
 
 
 class _PointEncoder(_Points):
-    def __init__(self, widths: tuple[int, int, int], hidden: tuple[int, int]) -> None:
-        super().__init__(widths)
-        self.stn = _Transform(widths, hidden)
+    def __init__(self) -> None:
+        super().__init__()
+        self.stn = _Transform()
 
     def forward(self, points: Tensor) -> Tensor:
-        """(1, 3, N) to (1, widths[2])."""
+        """(1, 3, N) to (1, 1024)."""
         return self.pooled((points.transpose(2, 1) @ self.stn(points)).transpose(2, 1))
 
 
 class PointNet(nn.Module):
-    """PointNet for classification (Qi et al., CVPR 2017).
+    """PointNet for classification (Qi et al., CVPR 2017)."""
 
-    Args:
-        widths: channels of the layers that every point passes.
-        hidden: channels of the layers after pooling.
-        classes: number of classes.
-    """
-
-    def __init__(
-        self,
-        widths: tuple[int, int, int] = (64, 128, 1024),
-        hidden: tuple[int, int] = (512, 256),
-        classes: int = 16,
-    ) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.feat = _PointEncoder(widths, hidden)
-        self.fc1 = nn.Linear(widths[2], hidden[0])
-        self.fc2 = nn.Linear(*hidden)
-        self.fc3 = nn.Linear(hidden[1], classes)
-        self.bn1 = nn.BatchNorm1d(hidden[0])
-        self.bn2 = nn.BatchNorm1d(hidden[1])
+        self.feat = _PointEncoder()
+        self.fc1 = nn.Linear(1024, 512)
+        self.fc2 = nn.Linear(512, 256)
+        self.fc3 = nn.Linear(256, 16)
+        self.bn1 = nn.BatchNorm1d(512)
+        self.bn2 = nn.BatchNorm1d(256)
 
     def forward(self, points: Tensor) -> Tensor:
         """(1, 3, N) to (1, D): the pooled features and those of the three layers after them."""
