@@ -173,6 +173,16 @@ def test_what_cannot_be_is_refused(
         ConfigError, match="expected TASK.STAGE=FILE with a task of pixel"
     ):
         call("reproduce", "table1", "--tiny", "--use", "latent.teacher=x.pth")
+    released = tmp_path / "x.pth"
+    released.touch()
+    for use, expected in {
+        f"pixel.techer={released}": "stage 'techer'.* Did you mean 'teacher'",
+        f"pixel.codec={released}": "stage 'codec'; expected one of 'teacher'",
+        f"pixel.teacher={released}s": "x.pths'; expected TASK.STAGE=FILE with a file",
+        "pixel.teacher": "expected TASK.STAGE=FILE with a file that exists",
+    }.items():
+        with pytest.raises(ConfigError, match=expected):
+            call("reproduce", "table1", "--tiny", "--use", use, "--out", tmp_path)
     monkeypatch.delenv("KITTI360_ROOT")
     with pytest.raises(
         ConfigError, match="no KITTI360_ROOT for latent; expected --data"

@@ -4,12 +4,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.generate.flow.distill import STRATEGIES
 from lidar_synth.lab.evaluate import PROTOCOLS
 from lidar_synth.lab.evaluate.features import describe_missing
 from lidar_synth.lab.evaluate.published import read_published, show_table
-from lidar_synth.lab.reproduce.tables import PaperTable
+from lidar_synth.lab.reproduce.tables import PaperTable, read_tables
 from lidar_synth.lab.reproduce.work import TaskRun
 from lidar_synth.lab.train.config import DistillConfig, load_config
 from lidar_synth.lab.train.state import read_progress
@@ -109,15 +110,21 @@ def given_weights(
     """{task: {stage: file}} of texts TASK.STAGE=FILE.
 
     Raises:
-        ConfigError: on another text.
+        ConfigError: on another text, a stage that the task does not have, or a missing file.
     """
     found: dict[str, dict[str, Path]] = {task: {} for task in tasks}
     for text in given:
         place, _, path = text.partition("=")
         task, _, stage = place.partition(".")
-        if task not in found or not stage or not path:
+        if task not in found:
             raise ConfigError(
                 f"--use {text!r}", f"TASK.STAGE=FILE with a task of {', '.join(tasks)}"
             )
-        found[task][stage] = Path(path)
+        stages = {**read_tables().tasks[task].stages, **STRATEGIES}
+        choose("stage", stage, stages)
+        found[task][stage] = file = Path(path)
+        if not file.is_file():
+            raise ConfigError(
+                f"--use {text!r}", "TASK.STAGE=FILE with a file that exists"
+            )
     return found
