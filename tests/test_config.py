@@ -281,6 +281,24 @@ def test_a_grid_that_is_none_is_refused(grid: str) -> None:
         load_config(DistillConfig, CONFIGS / "kitti360_student.yaml", [f"grid={grid}"])
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (["strategy=uniform_piecewise"], "which is uniform. Give grid=null"),
+        (["strategy=timestep_distillation"], "which is uniform. Give grid=null"),
+        (["grid=null", "also=[101]"], "101 steps of selection.candidates=100 times"),
+        (["grid=null", "intervals=101"], "Give selection.candidates=101 or more"),
+    ],
+)
+def test_a_student_that_could_not_be_trained_is_refused_at_once(
+    changes: list[str], message: str
+) -> None:
+    recipe = CONFIGS / "kitti360_student.yaml"
+    with pytest.raises(ConfigError, match=message):
+        load_config(DistillConfig, recipe, changes)
+    load_config(DistillConfig, recipe, ["strategy=reflow", "selection.candidates=3"])
+
+
 def test_files_that_are_no_configuration_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     with pytest.raises(FileError, match="cannot be read"):

@@ -86,7 +86,7 @@ def uniform_piecewise(
     Raises:
         ConfigError: on a grid that is not uniform.
     """
-    _check_uniform(grid)
+    check_uniform(grid)
     return adaptive_piecewise(teacher, y0, y1, u, grid, steps, cond)
 
 
@@ -139,7 +139,7 @@ def timestep_distillation(
     Raises:
         ConfigError: on a grid that is not uniform.
     """
-    _check_uniform(grid)
+    check_uniform(grid)
     start, _ = _bounds(interval_of(u, grid), grid, u)
     return _straight(teacher, y1, start, grid, steps, cond)
 
@@ -217,6 +217,9 @@ STRATEGIES: dict[str, Strategy] = {
 }
 """Strategies by name."""
 
+UNIFORM = ("uniform_piecewise", "timestep_distillation")
+"""Those that need a uniform grid."""
+
 
 def interval_of(t: Tensor, grid: Sequence[float]) -> Tensor:
     """(B,) index of the interval (t_{i+1}, t_i] of a descending grid that contains t; 0 = the
@@ -272,11 +275,16 @@ def _straight(
     return Example(y1 + per_sample(t - 1, y1) * slope, t, slope, steps * len(y1))
 
 
-def _check_uniform(grid: Sequence[float]) -> None:
+def check_uniform(grid: Sequence[float]) -> None:
+    """Check a time grid of a strategy of ``UNIFORM``.
+
+    Raises:
+        ConfigError: on a grid that is not uniform.
+    """
     uniform = uniform_grid(len(check_grid(grid)) - 1)
     if max(abs(a - b) for a, b in zip(grid, uniform, strict=True)) > 1e-6:
         raise ConfigError(
             f"time grid {tuple(grid)}",
             f"{uniform}, which is uniform",
-            "Or use adaptive_piecewise.",
+            "Give grid=null, or strategy=adaptive_piecewise.",
         )

@@ -104,8 +104,7 @@ class StudentStage(Stage):
         frozen = {name: networks.pop(name) for name in [CODEC] if name in networks}
         super().__init__(config, join(networks), header, frozen, device)
         self.selection = None
-        selects = config.grid is None and config.strategy == "adaptive_piecewise"
-        if selects and config.init is None:
+        if config.selects:
             self.selection = TimestepSelection(config, self.header)
 
     def prepare(

@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.files.recipes import find_recipe, merge, read_recipe, validate
+from lidar_synth.generate.flow.distill import UNIFORM, check_uniform
 from lidar_synth.generate.flow.solvers import read_grid
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.train.config.sections import Run
@@ -96,15 +97,28 @@ def check(config: Run) -> None:
             )
     if isinstance(config, TrainConfig):
         _check_train(config)
-    if (
-        isinstance(config, DistillConfig)
-        and config.grid is not None
-        and len(read_grid(config.grid)) != config.intervals + 1
-    ):
+    if isinstance(config, DistillConfig):
+        _check_distill(config)
+
+
+def _check_distill(config: DistillConfig) -> None:
+    candidates = config.selection.candidates
+    most = max((config.intervals, *config.also))
+    if config.selects and most > candidates:
+        raise ConfigError(
+            f"{most} steps of selection.candidates={candidates} times",
+            f"at most {candidates}",
+            f"Give selection.candidates={most} or more.",
+        )
+    if config.grid is None:
+        return
+    if len(read_grid(config.grid)) != config.intervals + 1:
         raise ConfigError(
             f"grid {list(config.grid)}",
             f"{config.intervals + 1} descending times from 1 to 0",
         )
+    if config.strategy in UNIFORM:
+        check_uniform(config.grid)
 
 
 def _check_train(config: TrainConfig) -> None:

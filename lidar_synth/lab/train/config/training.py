@@ -181,3 +181,9 @@ class DistillConfig(Run):
     grid: tuple[float, ...] | None = None
     also: tuple[Count, ...] = ()
     selection: SelectionSettings = SelectionSettings()
+
+    @property
+    def selects(self) -> bool:
+        """Whether timesteps are selected."""
+        given = self.grid or self.init
+        return given is None and self.strategy == "adaptive_piecewise"
