@@ -61,7 +61,7 @@ def test_the_distances_by_class_are_those_of_float64_definitions() -> None:
     dense = [np.stack([by_numpy(s).ravel() for s in side]) for side in scans]
     described = [[class_histogram(s) for s in side] for side in scans]
     jsd, mmd = (
-        KINDS[name].compare(*described, {}).value for name in ("class_jsd", "class_mmd")
+        KINDS[name].compare(*described).value for name in ("class_jsd", "class_mmd")
     )
     assert jsd == pytest.approx(
         jensenshannon(dense[0].sum(0), dense[1].sum(0)), rel=1e-6
@@ -72,7 +72,7 @@ def test_the_distances_by_class_are_those_of_float64_definitions() -> None:
         kernel(p, p) + kernel(q, q) - 2 * kernel(p, q), abs=1e-6
     )
     assert KINDS["class_jsd"].compare(
-        described[0], described[0], {}
+        described[0], described[0]
     ).value == pytest.approx(0, abs=1e-7)
 
 
@@ -83,7 +83,7 @@ def test_other_labels_on_the_same_points_are_another_scene() -> None:
         for s in scans
     ]
     both = [[class_histogram(s) for s in side] for side in (scans, swapped)]
-    assert KINDS["class_jsd"].compare(*both, {}).value > 0.1
+    assert KINDS["class_jsd"].compare(*both).value > 0.1
 
 
 def test_class_shares_sum_to_one_in_each_ring_that_has_labels() -> None:

@@ -70,13 +70,13 @@ def compared(protocol: str, name: str, real: list, fake: list) -> float:
     sides = [
         [
             kind.describe(
-                Scan(c, np.zeros(len(c), np.float32), SENSOR), measure.options
+                Scan(c, np.zeros(len(c), np.float32), SENSOR), **measure.options
             )
             for c in side
         ]
         for side in (real, fake)
     ]
-    return kind.compare(*sides, measure.options).value
+    return kind.compare(*sides, **measure.options).value
 
 
 def test_r2flow_histogram(vectors: Vectors) -> None:

@@ -236,7 +236,7 @@ class Metric:
                 key = _key(measure)
                 kind = KINDS[measure.kind]
                 if key not in described and (scan.label is not None or not kind.labels):
-                    described[key] = kind.describe(prepared, measure.options)
+                    described[key] = kind.describe(prepared, **measure.options)
         except DataError as error:
             raise DataError(f"{side} scan {scan.id!r}: {error}") from error
         return described
@@ -326,7 +326,8 @@ class Metric:
             return None
         real_scans = chosen(both[0], measure.real)
         fake_scans = both[1][: measure.generated]
-        compared = KINDS[measure.kind].compare(real_scans, fake_scans, measure.options)
+        compare = KINDS[measure.kind].compare
+        compared = compare(real_scans, fake_scans, **measure.options)
         return self._made(measure, compared.value, compared, *compared.sizes)
 
     def _made(

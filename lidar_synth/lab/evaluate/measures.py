@@ -4,7 +4,7 @@ To add a kind, write its two functions and add a line to ``KINDS``; a protocol i
 then names it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,21 +28,19 @@ from lidar_synth.lab.evaluate.statistics import (
     sparse_histogram_distance,
 )
 
-Options = Mapping[str, Any]
-
 
 class Kind(NamedTuple):
     """A way to compare two sets of scans.
 
     Args:
-        describe: ``(prepared scan, options) -> description``; measures that share it share the
+        describe: ``(prepared scan, **options) -> description``; measures that share it share the
             description.
-        compare: ``(real descriptions, generated descriptions, options) -> Statistic``.
+        compare: ``(real descriptions, generated descriptions, **options) -> Statistic``.
         labels: whether scans need labels.
     """
 
-    describe: Callable[[Scan, Options], Any]
-    compare: Callable[[Sequence[Any], Sequence[Any], Options], Statistic]
+    describe: Callable[..., Any]
+    compare: Callable[..., Statistic]
     labels: bool = False
 
 
@@ -77,41 +75,19 @@ def normalised_sparse_rows(histograms: Sequence[Sparse], size: int) -> Rows:
     return rows
 
 
-def _bev(scan: Scan, options: Options) -> NDArray[np.uint32]:
+def _bev(scan: Scan, **options: Any) -> NDArray[np.uint32]:
     return bev_histogram(scan.points, **options)
 
 
-def _occupied(scan: Scan, options: Options) -> NDArray[np.int32]:
-    return lidm.find_occupied(scan.points, options["cell"])
+def _occupied(scan: Scan, cell: float) -> NDArray[np.int32]:
+    return lidm.find_occupied(scan.points, cell)
 
 
-def _classes(scan: Scan, options: Options) -> Sparse:
-    return class_histogram(scan, **options)
-
-
-def _ranges(scan: Scan, options: Options) -> NDArray[np.uint32]:
-    return range_histogram(scan)
-
-
-def _steps(scan: Scan, options: Options) -> NDArray[np.uint32]:
-    return step_histogram(scan)
-
-
-def _isolated(scan: Scan, options: Options) -> NDArray[np.int64]:
-    return count_isolated(scan)
-
-
-def _isolated_ratio(
-    real: Sequence[Any], fake: Sequence[Any], options: Options
-) -> Statistic:
-    return isolated_ratio(real, fake)
-
-
-def _jsd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
+def _jsd(real: Sequence[Any], fake: Sequence[Any], **options: Any) -> Statistic:
     return histogram_distance(real, fake)
 
 
-def _mmd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
+def _mmd(real: Sequence[Any], fake: Sequence[Any], **options: Any) -> Statistic:
     return gaussian_mmd(
         normalised_rows(real),
         normalised_rows(fake),
@@ -122,37 +98,35 @@ def _mmd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statisti
 
 def _occupancy(
     distance: Callable[..., Statistic], *more: Any
-) -> Callable[[Sequence[Any], Sequence[Any], Options], Statistic]:
+) -> Callable[..., Statistic]:
     """How often each cell is occupied."""
 
-    def compare(
-        real: Sequence[Any], fake: Sequence[Any], options: Options
-    ) -> Statistic:
+    def compare(real: Sequence[Any], fake: Sequence[Any], cell: float) -> Statistic:
         once = [
             [Sparse(cells, np.ones(len(cells), np.uint8)) for cells in side]
             for side in (real, fake)
         ]
-        return distance(*once, lidm.cells_along(options["cell"]) ** 2, *more)
+        return distance(*once, lidm.cells_along(cell) ** 2, *more)
 
     return compare
 
 
-def _matching(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
-    return smallest_of_pairs(lidm.matching_distances(real, fake, options["cell"]))
+def _matching(real: Sequence[Any], fake: Sequence[Any], cell: float) -> Statistic:
+    return smallest_of_pairs(lidm.matching_distances(real, fake, cell))
 
 
-def _class_jsd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
-    return sparse_histogram_distance(real, fake, _class_bins(options))
+def _class_jsd(
+    real: Sequence[Any], fake: Sequence[Any], bins: int = BINS, **options: Any
+) -> Statistic:
+    return sparse_histogram_distance(real, fake, CLASSES * bins**2)
 
 
-def _class_mmd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
-    bins = _class_bins(options)
-    rows = [normalised_sparse_rows(side, bins) for side in (real, fake)]
-    return gaussian_mmd(rows[0], rows[1], (len(real), len(fake)), bins)
-
-
-def _class_bins(options: Options) -> int:
-    return CLASSES * int(options.get("bins", BINS)) ** 2
+def _class_mmd(
+    real: Sequence[Any], fake: Sequence[Any], bins: int = BINS, **options: Any
+) -> Statistic:
+    size = CLASSES * bins**2
+    rows = [normalised_sparse_rows(side, size) for side in (real, fake)]
+    return gaussian_mmd(*rows, (len(real), len(fake)), size)
 
 
 KINDS = {
@@ -163,10 +137,10 @@ KINDS = {
         _occupied, _occupancy(sparse_histogram_distance, total_variation)
     ),
     "minimum_matching": Kind(_occupied, _matching),
-    "class_jsd": Kind(_classes, _class_jsd, labels=True),
-    "class_mmd": Kind(_classes, _class_mmd, labels=True),
-    "range_jsd": Kind(_ranges, _jsd),
-    "step_mmd": Kind(_steps, _mmd),
-    "isolated_ratio": Kind(_isolated, _isolated_ratio),
+    "class_jsd": Kind(class_histogram, _class_jsd, labels=True),
+    "class_mmd": Kind(class_histogram, _class_mmd, labels=True),
+    "range_jsd": Kind(range_histogram, _jsd),
+    "step_mmd": Kind(step_histogram, _mmd),
+    "isolated_ratio": Kind(count_isolated, isolated_ratio),
 }
 """Kinds by name; those of features are in ``features.py``."""
