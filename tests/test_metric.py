@@ -222,6 +222,14 @@ def test_scans_of_another_sensor_are_refused() -> None:
         evaluate([REAL[0], other], FAKE, "town", progress=False)
     with pytest.raises(DataError, match="the sensor of the lidm protocol"):
         Metric("lidm").update([other], real=True)
+    metric = Metric("town")
+    metric.update([other], real=False)
+    with pytest.raises(DataError, match="real scan .* expected that of scan .*hdl32e"):
+        metric.update(REAL, real=True)
+    metric.reset()
+    with pytest.raises(DataError, match="'empty'"):
+        metric.update([replace(other[:0], id="empty")], real=True)
+    metric.update(REAL, real=True)  # a failed update leaves nothing
     assert evaluate(REAL, [other], "town", progress=False, anyway=True)
     assert alike(presets()["hdl64e_kitti"], presets()["hdl64e_semantic_kitti"])
 

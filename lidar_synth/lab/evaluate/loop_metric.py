@@ -142,7 +142,7 @@ class Metric:
             weights.
 
     Raises:
-        ConfigError: on an unknown protocol.
+        ConfigError: on an unknown protocol, a missing folder, or too few resamples.
 
     Example:
         >>> import numpy as np
@@ -207,11 +207,13 @@ class Metric:
             self._add(batch, SIDES[not real])
 
     def _add(self, scans: Sequence[Scan], side: str) -> None:
-        part = _Kept(count=len(scans))
+        own = scans[0].sensor, scans[0].id
+        part = _Kept(count=len(scans), sensor=own)
+        first = self._kept["real"].sensor or self._kept["generated"].sensor or own
         generated = side == "generated"
         measured = [m for m in self.protocol.measures.values() if m.kind != FEATURES]
         for scan in scans:
-            self._check_sensor(scan, side)
+            self._check_sensor(scan, side, first)
             for key, description in self._describe(
                 scan, generated, measured, side
             ).items():
@@ -241,10 +243,8 @@ class Metric:
             raise DataError(f"{side} scan {scan.id!r}: {error}") from error
         return described
 
-    def _check_sensor(self, scan: Scan, side: str) -> None:
+    def _check_sensor(self, scan: Scan, side: str, first: tuple[Sensor, str]) -> None:
         grid = self.protocol.prepare.grid
-        first = self._kept["real"].sensor or self._kept[side].sensor
-        self._kept[side].sensor = self._kept[side].sensor or (scan.sensor, scan.id)
         if self._any_sensor:
             return
         given = f"{side} scan {scan.id!r} of sensor {_named(scan.sensor)}"
@@ -254,7 +254,7 @@ class Metric:
                 f"{_named(grid)}, the sensor of the {self.protocol.name} protocol",
                 "The protocol town takes any sensor.",
             )
-        if grid is None and first is not None and not alike(scan.sensor, first[0]):
+        if grid is None and not alike(scan.sensor, first[0]):
             raise DataError(
                 given,
                 f"that of scan {first[1]!r}, {_named(first[0])}",
