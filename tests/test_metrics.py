@@ -158,6 +158,11 @@ def test_squared_mmd_by_hand() -> None:
     across = (1 + 1 + 8 + 27) / 4
     assert squared_mmd(a, b, subsets=3) == pytest.approx(within - 2 * across)
     assert squared_mmd(a, a, subsets=3) == pytest.approx(2 - 2 * (1 + 1 + 1 + 8) / 4)
+    # subsets that would all be the whole sets are compared once
+    many, one = (np.random.default_rng(0) for _ in range(2))
+    squared_mmd(a, b, many, subsets=9)
+    squared_mmd(a, b, one, subsets=1)
+    assert many.random() == one.random()
     # All pairs of disjoint halves of one set: 0 on average.
     everything = np.arange(6.0)[:, None] / 3
     halves = [list(chosen) for chosen in combinations(range(6), 3)]

@@ -102,6 +102,8 @@ def squared_mmd(
     real, generated = checked_features(real, generated)
     rng = np.random.default_rng(0) if rng is None else rng
     size = min(len(real), len(generated), size)
+    if size == len(real) == len(generated):
+        subsets = 1  # each would hold all samples
     total = 0.0
     for _ in range(subsets):
         x = generated[rng.choice(len(generated), size, replace=False)]
