@@ -33,7 +33,7 @@ from lidar_synth.errors import (
 from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import presets
-from lidar_synth.lab.evaluate import frechet_distance
+from lidar_synth.lab.evaluate import Metric, frechet_distance
 from lidar_synth.lab.evaluate.extractors import EXTRACTORS, load_extractor
 from lidar_synth.lab.evaluate.extractors.archive import Archive
 from lidar_synth.lab.evaluate.extractors.bonnetal import (
@@ -453,7 +453,10 @@ def test_a_faulty_archive_is_refused_and_the_right_one_named(
 
 
 def test_what_cannot_be_extracted_is_refused(
-    archives: Callable[[str], Path], scan: Scan, monkeypatch: pytest.MonkeyPatch
+    archives: Callable[[str], Path],
+    scan: Scan,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("LIDAR_SYNTH_METRICS", raising=False)
     with pytest.raises(ConfigError, match="extractor 'inception'"):
@@ -463,6 +466,13 @@ def test_what_cannot_be_extracted_is_refused(
         match="minkowskinet or minkowskinet_lidm in the folder that LIDAR_SYNTH_METRICS",
     ):
         load_extractor("lidm_minkowski")
+    with pytest.raises(ConfigError, match="none for weights; expected a folder that"):
+        Metric("r2flow", weights=tmp_path / "none")
+    monkeypatch.setenv("LIDAR_SYNTH_METRICS", "nowhere")
+    with pytest.raises(ConfigError, match="nowhere for weights"):
+        load_extractor("lidm_minkowski")
+    setup = CliRunner().invoke(app, ["metrics", "setup"])
+    assert setup.stdout.count(": missing") == len(EXTRACTORS)
     with pytest.raises(ConfigError, match="preparation 'spiral'"):
         load_extractor("lidm_minkowski", archives("lidm_minkowski"), "spiral")
     extract = load_extractor("lidm_minkowski", archives("lidm_minkowski"))

@@ -69,7 +69,7 @@ def _status(name: str, spec: "ExtractorSpec", folder: Path | None) -> dict[str, 
     """What to fetch for an extractor, and whether it is there."""
     from lidar_synth.lab.evaluate.cache import weights_hash
 
-    path = spec.found(folder) if folder else None
+    path = spec.found(folder) if folder and folder.is_dir() else None
     return {
         "measure": spec.measure,
         "state": _state(name, spec, path),

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 
 FOLDER_VARIABLE = "LIDAR_SYNTH_METRICS"
@@ -70,12 +71,18 @@ class ExtractorSpec(NamedTuple):
 
     def found(self, folder: Path | None = None) -> Path | None:
         """The path of the weights in a folder, by default the one that LIDAR_SYNTH_METRICS names;
-        None without."""
+        None without.
+
+        Raises:
+            ConfigError: if there is no such folder.
+        """
         named = os.environ.get(FOLDER_VARIABLE)
         folder = folder or (Path(named) if named else None)
-        if folder:
-            return next((p for p in self.paths(folder) if p.exists()), None)
-        return None
+        if folder is None:
+            return None
+        if not folder.is_dir():
+            raise ConfigError(f"{folder} for weights", "a folder that exists")
+        return next((p for p in self.paths(folder) if p.exists()), None)
 
     def is_published(self, path: Path) -> bool:
         """Whether a file has the hash of the published one."""
