@@ -71,6 +71,7 @@ def test_isolated_returns_are_counted_by_class() -> None:
     assert counts[:, TRAIN_ID["pole"]].tolist() == [1, 1]
     assert counts[:, -1].tolist() == [1, 1]
     assert counts.sum(1).tolist() == [2, 102]  # the far and the near one do not count
+    assert count_isolated(scan[100:103]).sum(1).tolist() == [2, 2]  # no neighbours
     doubled = isolated_ratio([counts], [counts * [[2], [1]]])
     assert doubled.value == pytest.approx(2)
 

@@ -28,7 +28,7 @@ def count_isolated(scan: Scan) -> NDArray[np.int64]:
     kinds = np.full(near.sum(), len(NAMES))
     if scan.label is not None:
         kinds = np.minimum(scan.label[near], len(NAMES))
-    found = np.zeros(len(kinds), bool)
+    found = np.ones(len(kinds), bool)
     if len(scan) > NEIGHBOURS:
         # The nearest one is the return itself.
         apart, _ = cKDTree(scan.points).query(scan.points[near], [NEIGHBOURS + 1])

@@ -328,7 +328,11 @@ class Metric:
         fake_scans = both[1][: measure.generated]
         compare = KINDS[measure.kind].compare
         compared = compare(real_scans, fake_scans, **measure.options)
-        return self._made(measure, compared.value, compared, *compared.sizes)
+        value = compared.value
+        if not np.isfinite(value):
+            self.left_out[name] = "no finite value for these scans"
+            return None
+        return self._made(measure, value, compared, *compared.sizes)
 
     def _made(
         self,
