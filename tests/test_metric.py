@@ -160,6 +160,7 @@ def test_intervals_hold_the_values_and_features_get_them_with_enough_scans() -> 
         for end in ("", ", infinitely many samples")
     )
     assert unbiased.value < frechet.value
+    assert sum("squared maximum mean discrepancy" in name for name in by_name) == 1
     few = evaluate(
         REAL,
         FAKE,
@@ -206,9 +207,15 @@ def test_one_scan_has_no_frechet_distance() -> None:
     ):
         evaluate(REAL[:1], FAKE, "town", {"moments": moments}, progress=False)
     with pytest.raises(
-        DataError, match="1 real and 4 generated samples; expected at least two of each"
+        DataError, match="1 real and 4 generated scans; expected at least two of each"
     ):
         evaluate(REAL[:1], FAKE, "town", progress=False, replicates=20)
+
+
+@pytest.mark.parametrize("replicates", [19, -5])
+def test_too_few_resamples_are_refused_before_any_scan(replicates: int) -> None:
+    with pytest.raises(ConfigError, match=f"{replicates} resamples; .* 0 for no"):
+        Metric("town", replicates=replicates)
 
 
 def test_scans_of_another_sensor_are_refused() -> None:
@@ -232,6 +239,14 @@ def test_scans_of_another_sensor_are_refused() -> None:
     metric.update(REAL, real=True)  # a failed update leaves nothing
     assert evaluate(REAL, [other], "town", progress=False, anyway=True)
     assert alike(presets()["hdl64e_kitti"], presets()["hdl64e_semantic_kitti"])
+
+
+def test_a_figure_that_is_not_finite_is_left_out() -> None:
+    near = [s[np.linalg.norm(s.points, axis=1) < 7.9] for s in REAL[:2]]
+    left_out: dict[str, str] = {}
+    scores = evaluate(near, FAKE, "general", progress=False, left_out=left_out)
+    assert left_out == {"isolated": "no finite value for these scans"}
+    assert all(np.isfinite(s.value) for s in scores) and len(scores) == 4
 
 
 def test_measures_of_classes_are_left_out_without_labels() -> None:

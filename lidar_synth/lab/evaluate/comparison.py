@@ -75,6 +75,11 @@ def evaluate(
         warnings.warn(note, stacklevel=2)
     if processes > 1:
         _fill(rules, (real, generated), weights, cache, processes, batch)
+    if replicates and min(len(real), len(generated)) < 2:
+        raise DataError(
+            f"{len(real)} real and {len(generated)} generated scans",
+            "at least two of each for an interval",
+        )
     metric = Metric(
         rules, extractors, weights, replicates, extended, anyway, batch, cache
     )

@@ -11,6 +11,8 @@ from lidar_synth.lab.evaluate.distances import checked_features, frechet_distanc
 from lidar_synth.lab.evaluate.statistics import Statistic
 
 REPLICATES = 200
+FEWEST = 20
+"""Usual and least numbers of resamples."""
 LEVEL = 0.95
 _BATCH = 50  # resamples that are evaluated at a time
 
@@ -68,13 +70,13 @@ def bootstrap(
         compare different ones: a resample may hold copies of one only.
 
     Raises:
-        ConfigError: on a level outside (0, 1) or fewer than 20 resamples.
+        ConfigError: on a level outside (0, 1) or fewer than ``FEWEST`` resamples.
         DataError: with a set of one sample.
     """
-    if not 0 < level < 1 or replicates < 20:
+    if not 0 < level < 1 or replicates < FEWEST:
         raise ConfigError(
             f"level {level} and {replicates} resamples",
-            "a level in (0, 1) and at least 20 resamples",
+            f"a level in (0, 1) and at least {FEWEST} resamples",
         )
     if min(statistic.sizes) < 2:
         raise DataError(

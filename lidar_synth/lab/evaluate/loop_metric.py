@@ -16,7 +16,7 @@ import numpy as np
 import torch.distributed
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.cache import checked
@@ -29,7 +29,7 @@ from lidar_synth.lab.evaluate.features import (
     more_figures,
     statistic_of,
 )
-from lidar_synth.lab.evaluate.intervals import LEVEL, bootstrap
+from lidar_synth.lab.evaluate.intervals import FEWEST, LEVEL, bootstrap
 from lidar_synth.lab.evaluate.measures import KINDS
 from lidar_synth.lab.evaluate.protocols import (
     FEATURES,
@@ -166,6 +166,11 @@ class Metric:
         batch: int = 16,
         cache: Path | None = None,
     ) -> None:
+        if replicates and replicates < FEWEST:
+            raise ConfigError(
+                f"intervals from {replicates} resamples",
+                f"at least {FEWEST}, or 0 for no intervals",
+            )
         self.protocol = find_protocol(protocol)
         self.left_out: dict[str, str] = {}
         self._kept = {side: _Kept() for side in SIDES}
