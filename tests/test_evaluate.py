@@ -175,6 +175,23 @@ def test_another_sensor_is_refused(
         metric.update(open_scans(call[2]), real=False)
 
 
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("--protocol town --columns 512", "--columns: goes with --judge"),
+        ("--objects --weights w", "--weights: goes with --protocol"),
+        ("--judge j --intervals 50", "--intervals: goes with --protocol"),
+        ("--detector d --cache c", "--cache: goes with --protocol"),
+        ("--judge j --anyway", "--anyway: goes with --protocol"),
+    ],
+)
+def test_options_of_another_comparison_are_a_wrong_call(
+    folders: tuple[Path, Path], call: str, message: str
+) -> None:
+    result = CliRunner().invoke(app, ["evaluate", *map(str, folders), *call.split()])
+    assert result.exit_code == 2 and message in result.stderr
+
+
 def test_an_unknown_protocol_is_a_wrong_call(folders: tuple[Path, Path]) -> None:
     result = CliRunner().invoke(
         app, ["evaluate", *map(str, folders), "--protocol", "frid"]

@@ -142,6 +142,22 @@ def evaluate(
             "give --protocol, --judge, --objects or --detector, one of them",
             param_hint="--protocol",
         )
+    of_protocol = {
+        "--segmenter": segmenter,
+        "--weights": weights,
+        "--extended": extended,
+        "--intervals": intervals,
+        "--cache": cache,
+        "--processes": processes > 1,
+        "--anyway": anyway,
+    }
+    for needed, chosen, options in (
+        ("--protocol", protocol, of_protocol),
+        ("--judge", judge, {"--columns": columns}),
+    ):
+        for option, given in options.items():
+            if given and chosen is None:
+                raise typer.BadParameter(f"goes with {needed}", param_hint=option)
     if protocol is not None and protocol not in PROTOCOLS:
         known = f"{protocol!r} is none of {', '.join(PROTOCOLS)}. {suggest(protocol, PROTOCOLS)}"
         raise typer.BadParameter(known, param_hint="--protocol")
