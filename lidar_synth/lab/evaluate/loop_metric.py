@@ -216,12 +216,9 @@ class Metric:
         part = _Kept(count=len(scans), sensor=own)
         first = self._kept["real"].sensor or self._kept["generated"].sensor or own
         generated = side == "generated"
-        measured = [m for m in self.protocol.measures.values() if m.kind != FEATURES]
         for scan in scans:
             self._check_sensor(scan, side, first)
-            for key, description in self._describe(
-                scan, generated, measured, side
-            ).items():
+            for key, description in self._describe(scan, generated, side).items():
                 part.descriptions.setdefault(key, []).append(description)
         for name, extract in self._extractors.items():
             part.features[name] = [checked(extract, scans)]
@@ -229,13 +226,8 @@ class Metric:
             part.features[_own(name)] = [checked(paired, scans, generated)]
         self._kept[side].add(part)
 
-    def _describe(
-        self,
-        scan: Scan,
-        generated: bool,
-        measures: Sequence[Measure],
-        side: str,
-    ) -> dict[str, Any]:
+    def _describe(self, scan: Scan, generated: bool, side: str) -> dict[str, Any]:
+        measures = [m for m in self.protocol.measures.values() if m.kind != FEATURES]
         described: dict[str, Any] = {}
         try:
             prepared = self.protocol.prepare.apply(scan, generated)
