@@ -509,7 +509,8 @@ class MixedEpochs:
                 given == planned,
                 f"it is for {planned} real samples, but there are {given}",
             )
-        self._epoch = multiprocessing.Value("q", 0)
+        # without a lock, which spawned workers cannot share
+        self._epoch = multiprocessing.Value("q", 0, lock=False)
         self._loaded = (-1, np.zeros((0, 2), np.int64))
 
     def set_epoch(self, epoch: int) -> None:

@@ -303,12 +303,21 @@ def plain(samples: list[Any]) -> list[str]:
     return [number_of(sample) for sample in samples]
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_workers_follow_the_epoch(cases: Path, workers: int) -> None:
+@pytest.mark.parametrize(
+    ("workers", "start"), [(0, None), (2, None), (1, "spawn")], ids=str
+)
+def test_workers_follow_the_epoch(
+    cases: Path, workers: int, start: str | None
+) -> None:
     train = planned(cases, "generated")
     loader = DataLoader(
-        train, 4, collate_fn=plain, num_workers=workers, persistent_workers=workers > 0
-    )  # type: ignore[arg-type]
+        train,  # type: ignore[arg-type]
+        4,
+        collate_fn=plain,
+        num_workers=workers,
+        persistent_workers=workers > 0,
+        multiprocessing_context=start,
+    )
     orders = []
     for epoch in (0, 1, 2, 0):
         train.set_epoch(epoch)
