@@ -50,7 +50,7 @@ try:
     )
     from mmdet3d.registry import DATA_SAMPLERS, DATASETS, HOOKS
     from mmdet3d.structures import LiDARInstance3DBoxes
-    from mmengine.dataset import DefaultSampler
+    from mmengine.dataset import ClassBalancedDataset, DefaultSampler
     from mmengine.fileio.backends import BaseStorageBackend, register_backend
     from mmengine.hooks import Hook
     from mmengine.runner import EpochBasedTrainLoop
@@ -320,13 +320,23 @@ def _checked(dataset: Any) -> list[SlotFolder]:
         )
     for each in mixed:
         _check_dataset(each)
-    if any(isinstance(each, CBGSDataset) for each in inner(dataset)):
-        raise ConfigError(
-            "CBGSDataset around a mixed list: it repeats scans by class, which changes the ratio",
-            "the dataset without it",
-            "Balance the real scans by write_infos(..., balance=True).",
-        )
-    return [open_folder(Path(each.ann_file).resolve().parent) for each in mixed]
+    for each in inner(dataset):
+        if isinstance(each, CBGSDataset | ClassBalancedDataset):
+            raise ConfigError(
+                f"{type(each).__name__} around a mixed list: it repeats scans by class, which "
+                "changes the ratio",
+                "the dataset without it",
+                "Balance the real scans by write_infos(..., balance=True).",
+            )
+    folders = [open_folder(Path(each.ann_file).resolve().parent) for each in mixed]
+    for each, folder in zip(mixed, folders, strict=True):
+        if len(each) != (listed := folder.real + folder.slots):
+            raise ConfigError(
+                f"a dataset with {len(each)} of the {listed} entries of {each.ann_file}",
+                "all of them",
+                "Leave indices out; real scans alone are fewer by a shorter list of them.",
+            )
+    return folders
 
 
 def _check_dataset(dataset: Any) -> None:

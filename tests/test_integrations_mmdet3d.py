@@ -39,7 +39,7 @@ from lidar_synth.integrations.mmdet3d_slots import Folder, open_folder, read_url
 from mmdet3d.registry import DATASETS, TRANSFORMS
 from mmdet3d_parts import CONFIGS, DATA_KEYS, bare, flat
 from mmengine.config import Config
-from mmengine.dataset import pseudo_collate
+from mmengine.dataset import ClassBalancedDataset, pseudo_collate
 from mmengine.fileio import get
 from mmengine.registry import init_default_scope
 from streets import CAMERA, held, kitti, semantic_kitti, street, synthetic
@@ -529,9 +529,13 @@ def test_datasets_that_do_not_fit_are_refused(made: Path, tmp_path: Path) -> Non
         ConfigError, match="KittiDataset with a mixed list.*SynthKittiDataset"
     ):
         adapter.SynthSampler(detection(made, [PACK_BOXES], type="KittiDataset"))
-    wrapped = DATASETS.build(
-        {"type": "RepeatDataset", "times": 2, "dataset": segmentation(made, [PACK])}
-    )
+    with pytest.raises(ConfigError, match=f"4 of the {REAL + EXTRA} entries.*indices"):
+        adapter.SynthSampler(segmentation(made, [PACK], indices=4))
+    own = segmentation(made, [PACK])
+    own.get_cat_ids = lambda number: [number % 2]
+    with pytest.raises(ConfigError, match="ClassBalancedDataset.*balance=True"):
+        adapter.SynthSampler(ClassBalancedDataset(own, 1e-3))
+    wrapped = DATASETS.build({"type": "RepeatDataset", "times": 2, "dataset": own})
     assert len(adapter.SynthSampler(wrapped)) == 2 * (REAL + EXTRA)
 
 
