@@ -6,8 +6,8 @@ on a mixture::
         -d DATASET -ac ARCH.yaml ...
 
 The trainer's own parser reads every scan: a synthetic one is passed through a temporary file in
-memory (``/dev/shm`` on Linux). Validation, and scripts other than ``train.py``, see only real
-scans.
+memory (``/dev/shm`` on Linux). Validation, and scripts that do not train, see only real scans.
+Other training scripts than ``train.py``, as CENet's for SemanticPOSS, are refused.
 """
 
 import sys
@@ -19,7 +19,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.launcher import prepare_script, run
+from lidar_synth.integrations.launcher import plain_errors, prepare_script, run
 from lidar_synth.integrations.mixture import (
     class_ids,
     id_table,
@@ -335,7 +335,15 @@ def main() -> None:
     if Path(script).with_name("__init__.py").is_file():
         # The trainer's own, which its scripts import first: it puts ../.. on the path.
         import_module("__init__")
-    register()
+    with plain_errors():
+        name = Path(script).name
+        if name.startswith("train") and name != "train.py":
+            raise ConfigError(
+                f"{name}, whose trainer would see real scans only",
+                "train.py",
+                "For another dataset: train.py with its -dc, and classes in the mixture's YAML.",
+            )
+        register()
     run(script)
 
 

@@ -99,3 +99,6 @@ def test_a_trainer_that_imports_its_parser_trains_on_the_mixture(
     assert [line[:3] for line in epochs(said)] == [(0, 10, 4), (1, 10, 4)]
     assert said.count("lengths 10 [2, 2, 2, 2, 2]") == 2
     assert "stays on the CPU" in said
+    (tmp_path / "train_poss.py").write_text(SCRIPT)
+    said = launched("rangenet", "train_poss.py", cwd=tmp_path, mixture=Path(), status=1)
+    assert "train_poss.py, whose trainer would see real scans only" in said
