@@ -297,7 +297,8 @@ class _Epochs:
         trainer = self._data.trainer
         if trainer is None:
             return self._batches.dataset.epoch
-        passes: int = trainer.current_epoch
+        # The same batches again, where they are to be overfitted.
+        passes: int = 0 if trainer.overfit_batches else trainer.current_epoch
         return max(self._least, self._data._first + passes)
 
     def _steps(self) -> CutSteps:

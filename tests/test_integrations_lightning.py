@@ -44,7 +44,7 @@ class Model(lightning.LightningModule):  # type: ignore[misc, name-defined]
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-def fit(data: Any, epochs: int = 2, checkpoint: Any = None) -> Model:
+def fit(data: Any, epochs: int = 2, checkpoint: Any = None, **options: Any) -> Model:
     model = Model()
     trainer = lightning.Trainer(
         max_epochs=epochs,
@@ -55,6 +55,7 @@ def fit(data: Any, epochs: int = 2, checkpoint: Any = None) -> Model:
         enable_model_summary=False,
         use_distributed_sampler=False,
         num_sanity_val_steps=0,
+        **options,
     )
     trainer.fit(model, data, ckpt_path=checkpoint)
     return model
@@ -74,6 +75,15 @@ def test_two_epochs_see_exactly_the_planned_scans() -> None:
         ]
         assert [name for _, name in seen] == wanted
     assert model.validated == 8
+
+
+def test_batches_that_are_overfitted_stay_the_same() -> None:
+    mixed = MixedScans(Scans("r", REAL), Endless(), ratio=0.25, seed=1)
+    model = fit(module.MixedData(mixed, batch_size=4), overfit_batches=2)
+    first, second = (
+        [name for e, _, name in model.seen if e == epoch] for epoch in (0, 1)
+    )
+    assert first == second and len(first) == 8
 
 
 class OfNumbers(Generated):
