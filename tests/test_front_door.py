@@ -3,11 +3,13 @@
 import ast
 import importlib
 import json
+import pickle
 import re
 import runpy
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -248,11 +250,12 @@ def test_scripts_are_of_any_folder(trainer: str, task: str, tmp_path: Path) -> N
     here.mkdir()
     files = configure(trainer, task, DEFAULTS[task], "/data/my scans", str(here))
     show = """{ printf '%s\\n' "$LIDAR_SYNTH_MIX" "$@"; }"""
-    script = f"python() {show}\nsed() {show}\n{files['train.sh']}"
+    stubs = "".join(f"{name}() {show}\n" for name in ("python", "sed", "ln"))
+    script = stubs + files["train.sh"]
     said = subprocess.run(
         ["bash", "-ec", script], stdout=subprocess.PIPE, text=True, check=True
     ).stdout
-    words = [said, *(path.read_text() for path in here.iterdir())]
+    words = [said, *(path.read_text() for path in here.glob("*.yaml"))]
     lines = "\n".join(words).splitlines()
     assert f"{here}/mix.yaml" in lines
     assert any("/data/my scans" in line for line in lines)
@@ -260,6 +263,8 @@ def test_scripts_are_of_any_folder(trainer: str, task: str, tmp_path: Path) -> N
 
 def test_the_lists_of_mmdetection3d_are_written(tmp_path: Path) -> None:
     MAKERS["semantic_kitti"](tmp_path / "scans")
+    sequences = tmp_path / "scans" / "sequences"
+    shutil.copytree(sequences / "00", sequences / "08")
     MAKERS["bank"](tmp_path / "bank")
     settings = {"synthetic": str(tmp_path / "bank"), **DEFAULTS["segmentation"]}
     files = configure(
@@ -270,26 +275,102 @@ def test_the_lists_of_mmdetection3d_are_written(tmp_path: Path) -> None:
     runpy.run_path(str(tmp_path / "lists.py"))
     infos = json.loads((tmp_path / "mixed" / "infos.json").read_text())
     assert len(infos["data_list"]) > 3
+    validation = pickle.loads((tmp_path / "val.pkl").read_bytes())["data_list"]
+    assert {entry["sample_id"][:2] for entry in validation} == {"08"}
     assert sorted((tmp_path / "scans").rglob("*")) == before
 
 
 def test_configurations_change_no_more_than_they_must(tmp_path: Path) -> None:
     """A list with a schedule is not repeated, the final test stays, and CENet's log has a name."""
 
-    def configured(trainer: str, task: str) -> dict[str, Any]:
-        files = configure(trainer, task, DEFAULTS[task], here=str(tmp_path))
-        write_files(files, tmp_path)
-        return runpy.run_path(str(tmp_path / "mixed.py"))
+    stock = SimpleNamespace(
+        train_pipeline=[{}, {}, {"db_sampler": {"rate": 1.0}}],
+        param_scheduler=[{"type": "CosineAnnealingLR", "begin": 32.0, "end": 80}],
+    )
 
-    dataset = configured("mmdet3d", "detection")["train_dataloader"]["dataset"]
+    def configured(trainer: str, task: str) -> dict[str, Any]:
+        text = configure(trainer, task, DEFAULTS[task], "/data", "/here")["mixed.py"]
+        made: dict[str, Any] = {"_base_": stock}
+        exec(re.sub("^_base_ = .*$", "", text, flags=re.MULTILINE), made)
+        return made
+
+    made = configured("mmdet3d", "detection")
+    dataset = made["train_dataloader"]["dataset"]
     assert dataset["times"] == 1
-    hooks = configured("pointcept", "segmentation")["hooks"]
+    assert made["train_cfg"] == {"max_epochs": 40}
+    assert made["param_scheduler"][0] == {
+        "type": "CosineAnnealingLR",
+        "begin": 16,
+        "end": 40,
+    }
+    sampled = dataset["dataset"]["pipeline"][2]["db_sampler"]
+    assert sampled == {
+        "rate": 1,
+        "data_root": "/here",
+        "info_path": "/here/dbinfos.pkl",
+    }
+    assert made["val_evaluator"] == {"ann_file": "/here/val.pkl"}
+    pointcept = configured("pointcept", "segmentation")
+    assert (pointcept["epoch"], pointcept["eval_epoch"]) == (40, 40)
+    assert pointcept["data"]["val"] == {"data_root": "/here/kitti"}
+    hooks = pointcept["hooks"]
     assert hooks[-1] == {"type": "PreciseEvaluator", "test_last": False}
     page = Path("docs/how-to/trainers/pointcept.md").read_text(encoding="utf-8")
     for hook in hooks:
         assert f'dict(type="{hook["type"]}"' in page
-    script = configure("rangenet", "segmentation", DEFAULTS["segmentation"])["train.sh"]
-    assert " -n " in script
+    files = configure("rangenet", "segmentation", DEFAULTS["segmentation"], "/d", "/h")
+    assert " -n " in files["train.sh"]
+
+
+def test_lightning_trains_on_the_training_split(tmp_path: Path) -> None:
+    MAKERS["semantic_kitti"](tmp_path / "scans")
+    sequences = tmp_path / "scans" / "sequences"
+    for other in ("08", "11"):
+        shutil.copytree(sequences / "00", sequences / other)
+    MAKERS["bank"](tmp_path / "bank")
+    MAKERS["folder"](tmp_path / "plain")
+    settings = {"synthetic": str(tmp_path / "bank"), "ratio": 0.5}
+    for root in ("scans", "plain"):
+        given = ("lightning", "segmentation", settings, str(tmp_path / root))
+        write_files(configure(*given, str(tmp_path)), tmp_path)
+        made: dict[str, Any] = {}
+        exec((tmp_path / "train.py").read_text().partition("data = ")[0], made)
+        assert made["train"].plan(0).reals == 1
+        assert len(made["train"].real[0]) == 3
+
+
+def test_every_trainer_finds_the_sequences(tmp_path: Path) -> None:
+    """Some of them read FOLDER/sequences, others FOLDER/dataset/sequences."""
+    root = tmp_path / "kitti" / "dataset"
+    (root / "sequences").mkdir(parents=True)
+    for given in (root, root.parent):
+        here = tmp_path / given.name
+        here.mkdir(exist_ok=True)
+        settings = DEFAULTS["segmentation"]
+        made = {
+            trainer: configure(
+                trainer, "segmentation", settings, str(given), str(here / "out")
+            )
+            for trainer in (
+                "mmdet3d",
+                "rangenet",
+                "cylinder3d",
+                "open3d_ml",
+                "waffleiron",
+            )
+        }
+        assert f'root = "{root}"\n' in made["mmdet3d"]["lists.py"]
+        assert f"-d {root} " in made["rangenet"]["train.sh"]
+        assert f'"{root}/sequences/"' in made["cylinder3d"]["train.sh"]
+        read = here / "out" / "kitti"
+        script = f"python() {{ :; }}\nsed() {{ :; }}\n{made['waffleiron']['train.sh']}"
+        subprocess.run(["bash", "-ec", script], check=True)
+        assert f"--path_dataset {read} " in script
+        assert (read / "dataset" / "sequences").samefile(root / "sequences")
+        lines = made["open3d_ml"]["train.py"].splitlines()
+        first = next(i for i, line in enumerate(lines) if line.startswith("link = "))
+        exec("\n".join(lines[first : first + 4]), {"Path": Path})
+        assert (read / "dataset" / "sequences").samefile(root / "sequences")
 
 
 def test_the_recipes_command_writes_a_trainers_files(tmp_path: Path) -> None:
@@ -310,6 +391,24 @@ def test_the_recipes_command_writes_a_trainers_files(tmp_path: Path) -> None:
         app, "recipes --trainer openpcdet --task segmentation".split()
     )
     assert "one of mmdet3d, pointcept" in str(wrong.exception)
+
+
+def test_a_trainers_files_name_folders_by_their_whole_paths(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("KITTI", "town_scans"):
+        Path(name).mkdir()
+    given = (
+        "recipes --trainer openpcdet --root KITTI --synthetic town_scans --out mixed"
+    )
+    result = CliRunner().invoke(app, given.split())
+    assert result.exit_code == 0, result.output
+    settings = read_settings(tmp_path / "mixed" / "mix.yaml")
+    assert settings["synthetic"] == str(tmp_path / "town_scans")
+    script = (tmp_path / "mixed" / "train.sh").read_text()
+    assert f"DATA_CONFIG.DATA_PATH {tmp_path}/KITTI" in script
+    assert "--epochs 40" in script
 
 
 def test_the_schema_of_a_recipe_knows_the_keys_of_published_ones() -> None:

@@ -2,11 +2,13 @@
 trainers."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from lidar_synth.errors import choose
 
 
 def recipes(
@@ -73,14 +75,10 @@ def _list(as_json: bool) -> None:
         typer.echo(json.dumps([asdict(one) for one in listed], indent=1))
         return
     rows = [("recipe", "command", "data", "parameters", "time")]
-    rows += [(one.name, one.command, one.data, one.size, one.time) for one in listed]
+    rows += [astuple(one)[:-1] for one in listed]  # all but the summary
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        typer.echo(
-            "  ".join(
-                cell.ljust(width) for cell, width in zip(row, widths, strict=True)
-            ).rstrip()
-        )
+        typer.echo("  ".join(map(str.ljust, row, widths)).rstrip())
 
 
 def _schema(name: str) -> dict[str, Any]:
@@ -88,7 +86,6 @@ def _schema(name: str) -> dict[str, Any]:
     from pydantic import BaseModel
 
     from lidar_synth.bake import BakeJob
-    from lidar_synth.errors import choose
     from lidar_synth.lab.train.config import DistillConfig, ModelConfig, TrainConfig
 
     kinds: dict[str, type[BaseModel]] = {
@@ -116,9 +113,18 @@ def _configure(
     )
 
     task = task or tasks_of(trainer)[0]
-    settings = {"synthetic": synthetic, **DEFAULTS.get(task, {}), "seed": 0}
-    folder = Path("." if out is None else out).resolve()
-    files = configure(trainer, task, settings, root, str(folder))
+    # The trainer runs in its own folder; names and URLs stay.
+    root, synthetic = (
+        str(Path(given).resolve()) if Path(given).exists() else given
+        for given in (root, synthetic)
+    )
+    settings = {
+        "synthetic": synthetic,
+        **choose("--task", task, DEFAULTS),
+        "seed": 0,
+    }
+    here = str((out or Path()).resolve())
+    files = configure(trainer, task, settings, root, here)
     if out is None:
         typer.echo("\n".join(f"# {name}\n{text}" for name, text in files.items()))
         return
