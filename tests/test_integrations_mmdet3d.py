@@ -6,6 +6,8 @@ installed."""
 import importlib
 import os
 import re
+import runpy
+import shutil
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -50,6 +52,7 @@ from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.calibration import in_view
 from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.lab.start.trainers import DEFAULTS, configure, write_files
 from lidar_synth.labels import ObjectBank
 
 REAL = 6
@@ -446,7 +449,7 @@ def test_unsuitable_training_data_is_refused_before_training(
     unlabelled = synthetic(tmp_path / "unlabelled", 2, labels=False)
     with pytest.raises(ConfigError, match="a model or bank with labels"):
         write_infos(tmp_path / "b", listed, MIX | {"synthetic": unlabelled}, **root)
-    with pytest.raises(ConfigError, match="settings .'rate'."):
+    with pytest.raises(ConfigError, match="setting of a mixture 'rate'"):
         write_infos(
             tmp_path / "d",
             listed,
@@ -537,6 +540,32 @@ def test_datasets_that_do_not_fit_are_refused(made: Path, tmp_path: Path) -> Non
         adapter.SynthSampler(ClassBalancedDataset(own, 1e-3))
     wrapped = DATASETS.build({"type": "RepeatDataset", "times": 2, "dataset": own})
     assert len(adapter.SynthSampler(wrapped)) == 2 * (REAL + EXTRA)
+
+
+@pytest.mark.parametrize("task", ["segmentation", "detection"])
+def test_a_recipe_trains_40_epochs_and_validates(task: str, tmp_path: Path) -> None:
+    if task == "detection":
+        root = kitti(tmp_path / "real", REAL)
+        (root / "ImageSets" / "val.txt").write_text("000004\n000005\n")
+    else:
+        root = semantic_kitti(tmp_path / "real", REAL)
+        shutil.copytree(root / "sequences" / "00", root / "sequences" / "08")
+    mix = DEFAULTS[task] | {"synthetic": str(synthetic(tmp_path / "s", 4))}
+    write_files(configure("mmdet3d", task, mix, str(root), str(tmp_path)), tmp_path)
+    runpy.run_path(str(tmp_path / "lists.py"))
+    config = Config.fromfile(str(tmp_path / "mixed.py"))
+    if task == "detection":  # the scans of the test have cars only
+        sampler = config.train_dataloader.dataset.dataset.pipeline[2].db_sampler
+        sampler.update(classes=["Car"], sample_groups={"Car": 5}, prepare={})
+    train = DATASETS.build(config.train_dataloader.dataset)
+    assert len(adapter.SynthSampler(train)) > 0 and train[0] is not None
+    for loader in (config.val_dataloader, config.test_dataloader):
+        held_out = DATASETS.build(loader.dataset)
+        assert len(held_out) == (2 if task == "detection" else REAL)
+        assert held_out[0]["inputs"]["points"].shape[1] == 4
+    assert config.train_cfg.max_epochs == config.param_scheduler[-1].end == 40
+    if task == "detection":
+        assert Path(config.val_evaluator.ann_file).is_file()
 
 
 @pytest.mark.parametrize("version", ["1.3.0", "2.0.0"])
