@@ -76,7 +76,10 @@ def test_real_samples_of_a_mixture_are_numbers(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"synthetic": "bank", "rate": 0.5}, "settings .'rate'."),
+        (
+            {"synthetic": "bank", "rate": 0.5},
+            "setting of a mixture 'rate'.*Did you mean 'ratio'",
+        ),
         ({"ratio": 0.5}, "without synthetic scans"),
         ({"synthetic": Endless(), "ratio": 2}, "ratio 2"),
         (
@@ -88,6 +91,8 @@ def test_real_samples_of_a_mixture_are_numbers(tmp_path: Path) -> None:
 def test_settings_that_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         mix_for_trainer(4, settings, as_is)
+    with pytest.raises(ConfigError, match="no real scan.*PATH/dataset/sequences"):
+        mix_for_trainer(0, {"synthetic": Endless()}, as_is)
 
 
 def test_settings_come_from_a_file_or_the_environment(

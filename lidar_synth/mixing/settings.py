@@ -13,7 +13,7 @@ import numpy as np
 
 from lidar_synth.bank import Bank, is_bank
 from lidar_synth.bank.storage import is_url
-from lidar_synth.errors import ConfigError, DataError, choose, suggest
+from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.as_sensor import make_transfer, read_transfer
@@ -234,13 +234,15 @@ def mix_for_trainer(
         loads them.
 
     Raises:
-        ConfigError: on an unknown key, or settings that ``MixedScans`` refuses.
+        ConfigError: on an unknown key, no real sample, or settings that ``MixedScans`` refuses.
     """
-    if unknown := sorted(set(settings) - set(OPTIONS)):
+    for key in settings:
+        choose("setting of a mixture", key, dict.fromkeys(OPTIONS))
+    if not real:
         raise ConfigError(
-            f"settings {unknown} of a mixture",
-            f"some of {', '.join(OPTIONS)}",
-            suggest(unknown[0], OPTIONS),
+            "a trainer that found no real scan",
+            "a path that leads to them",
+            "WaffleIron, Pointcept and Open3D-ML read PATH/dataset/sequences of SemanticKITTI.",
         )
     if "classes" in settings:
         raise ConfigError(
@@ -250,8 +252,7 @@ def mix_for_trainer(
         )
     if "loss_weight" in settings and not weighs:
         raise ConfigError(
-            f"loss_weight: {settings['loss_weight']} for this trainer, which adds up the losses "
-            "of all samples of a batch",
+            f"loss_weight: {settings['loss_weight']} for a trainer that adds up a batch's losses",
             "no key loss_weight",
             "Use a smaller ratio, or one that falls: ratio: {synthetic_first: EPOCHS}.",
         )
