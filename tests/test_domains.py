@@ -172,7 +172,9 @@ def test_persons_are_pasted_where_synthetic_scans_come_first(
 ) -> None:
     if not embreex:
         monkeypatch.setattr(defaults, "find_spec", lambda name: None)
-    [few, many] = (defaults.segmentation_options(n, 8, True) for n in (4, 41))
+    [few, many] = (
+        defaults.segmentation_options(range(n), 8, None, True) for n in (4, 41)
+    )
     assert few["labels"] == (defaults.TOWN_OBJECTS if embreex else "generated")
     assert "labels" not in many
     assert ("without embreex" in caplog.text) is not embreex

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any, Protocol, overload
+from typing import Any, Protocol
 
 from torch.utils.data import Sampler
 
@@ -65,17 +65,9 @@ class CutSteps(Sequence[range]):
     def __len__(self) -> int:
         return self.total
 
-    @overload
-    def __getitem__(self, number: int) -> range: ...
-
-    @overload
-    def __getitem__(self, number: slice) -> Sequence[range]: ...
-
-    def __getitem__(self, number: int | slice) -> range | Sequence[range]:
+    def __getitem__(self, number: int) -> range:  # type: ignore[override]  # no slices
         """The positions of a step; the last step takes all remaining positions, even if they exceed
         its size."""
-        if isinstance(number, slice):
-            return [self[i] for i in range(*number.indices(self.total))]
         if not -self.total <= number < self.total:
             raise IndexError(f"step {number} of {self.total}")
         number %= self.total

@@ -87,17 +87,28 @@ def ends_on_real(real: int, same_sensor: bool) -> bool:
     return real > FEW or not same_sensor
 
 
-def segmentation_options(real: int, epochs: int, same_sensor: bool) -> dict[str, Any]:
-    """The arguments of ``MixedScans`` for a segmenter; warns where no gain has been measured.
+def segmentation_options(
+    reals: Any, epochs: int, ratio: Any, same_sensor: bool
+) -> dict[str, Any]:
+    """The arguments of ``MixedScans`` for a segmenter, none with a ratio; warns of that, and where
+    no gain has been measured.
 
     Args:
-        real: as ``ends_on_real``.
+        reals: the real samples, or ``Sources`` of several.
         epochs: of the training.
+        ratio: in the place of the recipe's; None for none.
         same_sensor: as ``ends_on_real``.
 
     Raises:
         ConfigError: on fewer than 4 epochs.
     """
+    if ratio is not None:
+        log.warning(
+            f"epochs={epochs} has no effect beside ratio={ratio}: without ratio it chooses the "
+            "recipe for segmenters"
+        )
+        return {}
+    real = sum(len(source) for source, _ in each(reals))
     if real > MEASURED:
         log.warning(
             f"no gain has been measured with more than {MEASURED} labelled scans ({real} here): "

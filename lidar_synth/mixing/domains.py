@@ -3,6 +3,7 @@ normalisation, and layers of their own."""
 
 from collections.abc import Callable, Iterable
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import torch
@@ -67,20 +68,17 @@ def settle(
     for norm in norms:
         norm.reset_running_stats()
         norm.momentum = None  # the mean of all batches
+    run = model if forward is None else partial(forward, model)
     count = 0
     with torch.no_grad():
         for batch in batches:
-            (model if forward is None else _of(model, forward))(batch)
+            run(batch)
             count += 1
     if not count:
         raise ConfigError("no batch to settle on", "batches of real scans")
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum
     return model.eval()
-
-
-def _of(model: nn.Module, forward: Forward) -> Callable[[Any], Any]:
-    return lambda batch: forward(model, batch)
 
 
 class ByDomain(nn.Module):

@@ -36,7 +36,7 @@ from lidar_synth.mixing.schedules import (
     share_of,
     to_integer,
 )
-from lidar_synth.mixing.sources import check_together, each, loss_weights_of, sensor_of
+from lidar_synth.mixing.sources import agree, check_together, each, loss_weights_of
 from lidar_synth.mixing.synthetic import make_synthetic
 from lidar_synth.noise import keyed_rng
 
@@ -273,13 +273,15 @@ class MixedScans(Dataset[Any]):
             [3, 3, 3, 3]
         """
         own: dict[str, Any] = {"ratio": 0.25 if ratio is None else ratio}
-        if epochs is not None and ratio is None:
+        if epochs is not None:
             # It imports all that pastes objects.
             from lidar_synth.mixing.defaults import segmentation_options
 
-            count = sum(len(source) for source, _ in each(dataset))
-            alike = _same_lasers(synth, options.get("as_sensor"))
-            own = segmentation_options(count, epochs, alike)
+            transfer = make_transfer(options.get("as_sensor"))
+            alike = transfer is None or agree(
+                Sensor.same_lasers, transfer.target, synth
+            )
+            own |= segmentation_options(dataset, epochs, ratio, alike)
         return cls(
             dataset,
             synth,
@@ -550,14 +552,6 @@ def _check_lengths(reals: Iterable[tuple[Any, float | None]]) -> None:
                 "real scans first, then what synthetic ones come from",
                 "MixedScans(real, synth, ratio)",
             )
-
-
-def _same_lasers(synth: Any, as_sensor: Any) -> bool:
-    """Whether synthetic scans keep their lasers as scans of another sensor."""
-    transfer = make_transfer(as_sensor)
-    return transfer is None or all(
-        transfer.target.same_lasers(sensor_of(source)) for source, _ in each(synth)
-    )
 
 
 def _plan_synthetic(

@@ -5,7 +5,6 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.defaults import detection_options, segmentation_options
 from lidar_synth.mixing.scans import MixedScans, Ratio
-from lidar_synth.mixing.sources import each, sensor_of
+from lidar_synth.mixing.sources import agree, each, sensor_of
 
 log = logging.getLogger(__name__)
 
@@ -151,7 +150,7 @@ def mix(
     """
     reals = _open_real(real)
     synthetics = open_synthetic(synth)
-    alike = _agree(Sensor.same_lasers, reals, synthetics)
+    alike = agree(Sensor.same_lasers, reals, synthetics)
     if as_sensor == "auto":
         as_sensor = _transfer(reals, synthetics, alike)
     as_sensor = read_transfer(as_sensor, synthetics)
@@ -159,17 +158,15 @@ def mix(
     own = {}
     if task == "detection":
         own = detection_options(reals, epochs)
-    elif epochs is not None and ratio is None:
-        count = 0
+    elif epochs is not None:
+        own = segmentation_options(reals, epochs, ratio, alike)
         for source, _ in each(reals):
-            if source[0].label is None:
+            if own and source[0].label is None:
                 raise ConfigError(
                     f"epochs={epochs} with a source of real scans without labels",
                     "labelled scans, or synthetic ones alone: ratio=1.0, epoch_size=400",
                     "Then settle the network on the real scans (docs/how-to/mix.md).",
                 )
-            count += len(source)
-        own = segmentation_options(count, epochs, alike)
     given = {"ratio": ratio, "labels": labels, "as_sensor": as_sensor}
     own |= {name: value for name, value in given.items() if value is not None}
     known = inspect.signature(MixedScans).parameters
@@ -181,19 +178,11 @@ def mix(
 def _transfer(reals: Any, synthetics: Any, alike: bool) -> Transfer | None:
     """Turns synthetic scans into scans of the real ones' sensor; None if they are. Scans of other
     lasers, not ``alike``, get the distribution of the real scans' reflectance."""
-    if _agree(Sensor.same_grid, reals, synthetics):
+    if agree(Sensor.same_grid, reals, synthetics):
         return None
     [real, _], *_ = each(reals)
     [made, _], *_ = each(synthetics)
     return make_transfer(sensor_of(real), (0.0, 0.0), None if alike else real, made)
-
-
-def _agree(rule: Callable[[Sensor, Sensor], bool], reals: Any, synthetics: Any) -> bool:
-    """Whether a rule holds for the sensors of each real and each synthetic source."""
-    pairs = product(each(reals), each(synthetics))
-    return all(
-        rule(sensor_of(some), sensor_of(other)) for (some, _), (other, _) in pairs
-    )
 
 
 def _open_real(where: Any) -> Any:

@@ -1,6 +1,7 @@
 """``Sources``: several sources as one; and the check that sources can be mixed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -92,13 +93,14 @@ def loss_weights_of(source: Any) -> tuple[float, ...]:
 
 
 def sensor_of(source: Any) -> Sensor:
-    """The sensor of a source of scans: its attribute ``sensor``, or the sensor of its first scan.
+    """The sensor of a source of scans: its attribute ``sensor``, or the sensor of its first scan;
+    or the sensor that is given.
 
     Raises:
         ConfigError: if its samples are not scans.
         DataError: if it is empty.
     """
-    sensor = getattr(source, "sensor", None)
+    sensor = getattr(source, "sensor", source)
     if isinstance(sensor, Sensor):
         return sensor
     if not len(source):
@@ -111,6 +113,14 @@ def sensor_of(source: Any) -> Sensor:
             "MixedScans.wrap(dataset, synth, to_sample=...) takes a trainer's own dataset.",
         )
     return first.sensor
+
+
+def agree(rule: Callable[[Sensor, Sensor], bool], reals: Any, synthetics: Any) -> bool:
+    """Whether a rule holds for the sensors of each real and each synthetic source."""
+    pairs = product(each(reals), each(synthetics))
+    return all(
+        rule(sensor_of(some), sensor_of(other)) for (some, _), (other, _) in pairs
+    )
 
 
 def check_together(
