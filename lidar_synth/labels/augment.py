@@ -38,8 +38,7 @@ Augmentation = Callable[[Scan, np.random.Generator], Scan]
 def yaw(scan: Scan, rng: np.random.Generator, limit: float = 180.0) -> Scan:
     """Rotate the scan about the vertical axis by a random angle of up to ``limit`` degrees to
     either side."""
-    if not 0 <= limit <= 180:
-        raise ConfigError(f"limit={limit}", "0..180 degrees")
+    check_share("limit", limit, 180)
     angle = float(rng.uniform(-limit, limit))
     return rotate_scan(scan, float(np.radians(angle))).noted("yaw", degrees=angle)
 

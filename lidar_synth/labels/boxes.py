@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +15,7 @@ def box_frame(
 ) -> NDArray[np.float32]:
     """Transform points into the frame of one box (7,): (N, 3) metres along, across and above its
     centre."""
-    offset = points - box[:3]
-    c = np.cos(box[6])
-    s = np.sin(box[6])
-    return np.stack(
-        [
-            offset[:, 0] * c + offset[:, 1] * s,
-            offset[:, 1] * c - offset[:, 0] * s,
-            offset[:, 2],
-        ],
-        1,
-    )
+    return turn_points(points - box[:3], -box[6])
 
 
 def grow_box(
@@ -61,7 +52,7 @@ def turn_boxes(boxes: Boxes, angle: float) -> Boxes:
     return move_boxes(boxes, values)
 
 
-def turn_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
+def turn_points(points: NDArray[Any], angle: float | np.floating) -> NDArray[Any]:
     """(N, 2 or 3) points turned about the sensor, counter-clockwise by an angle in radians."""
     c = np.cos(angle)
     s = np.sin(angle)

@@ -114,10 +114,11 @@ class Step:
         make: Any = MOVES.get(self.name, kind)
         if kind is not None and "severity" in arguments:
             make = kind.at
-        given = () if kind else (None, None)
         try:
-            signature(make).bind(*given, **arguments)
-            return make(**arguments) if kind else partial(make, **arguments)
+            if kind:
+                return make(**arguments)
+            signature(make).bind(None, None, **arguments)
+            return partial(make, **arguments)
         except TypeError as error:
             known = [k for k in signature(make).parameters if k not in ("scan", "rng")]
             raise ConfigError(f"{self.name}: {error}", f"arguments {known}") from error

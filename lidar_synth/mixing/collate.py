@@ -196,12 +196,9 @@ _FORMS: dict[str, Callable[[Sequence[Item], Sensor | None], dict[str, Any]]] = {
 }
 
 
-def _columns(items: Sequence[Item]) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
-    return (
-        [i["points"] for i in items],
-        [i["label"] for i in items],
-        [i["confidence"] for i in items],
-    )
+def _columns(items: Sequence[Item]) -> list[list[Tensor]]:
+    names = ("points", "label", "confidence")
+    return [[item[name] for item in items] for name in names]
 
 
 def _offsets(parts: Sequence[Tensor]) -> Tensor:

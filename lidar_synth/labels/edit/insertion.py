@@ -74,19 +74,11 @@ class Placed(NamedTuple):
 
     def points(self, points: NDArray[np.float32]) -> NDArray[np.float64]:
         """(N, 3) recorded points at the new place, metres."""
-        offset = points - self.old[:3]
-        c = np.cos(self.old[6])
-        s = np.sin(self.old[6])
-        along = offset[:, 0] * c + offset[:, 1] * s
-        across = offset[:, 1] * c - offset[:, 0] * s
-        across = -across if self.mirrored else across
-        x, y, z, *_, yaw = self.box.astype(np.float64)
-        c = np.cos(yaw)
-        s = np.sin(yaw)
-        return np.stack(
-            [along * c - across * s + x, along * s + across * c + y, offset[:, 2] + z],
-            1,
-        )
+        local = turn_points(points - self.old[:3], -self.old[6])
+        if self.mirrored:
+            local[:, 1] *= -1
+        box = self.box.astype(np.float64)
+        return turn_points(local, box[6]) + box[:3]
 
 
 def insert(
