@@ -427,7 +427,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
         (
             "generated",
             {"fields": plain},
-            "labels='generated', but .* the synthetic scans only have.*Use labels='none'",
+            "keeps labels, but .* the synthetic scans only have.*Use labels='none'",
         ),
         (
             "generated",
@@ -442,7 +442,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
         (
             "condition",
             {"fields": plain},
-            "labels='condition', but .* the synthetic scans only have",
+            "keeps labels, but .* the synthetic scans only have",
         ),
         (
             "pseudo",

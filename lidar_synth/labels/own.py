@@ -96,7 +96,7 @@ class KeepLabels:
         Raises:
             ConfigError: if they do not.
         """
-        require_label("generated", fields)
+        require_label(fields)
         if self.threshold and "confidence" not in fields:
             raise ConfigError(
                 f"threshold {self.threshold} for synthetic scans without confidence",
@@ -108,8 +108,7 @@ class KeepLabels:
         return trust_labels(scan, label_of(scan), scan.confidence, self.threshold)
 
 
-@dataclass(frozen=True)
-class KeepCondition:
+class KeepCondition(KeepLabels):
     """``condition``: the labels of the semantic map that conditioned the scan, with
     confidence 1.
 
@@ -121,17 +120,8 @@ class KeepCondition:
         True
     """
 
-    def bind(self, real: Source | None, fields: frozenset[str]) -> "KeepCondition":
-        """Check that the scans have labels.
-
-        Raises:
-            ConfigError: if they do not.
-        """
-        require_label("condition", fields)
-        return self
-
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        return trust_labels(scan, label_of(scan), None)
+        return super().__call__(replace(scan, confidence=None), rng)
 
 
 @dataclass(frozen=True)
@@ -249,7 +239,7 @@ def check_count(name: str, value: int, least: int) -> None:
         raise ConfigError(given, f"a whole number, {least} or more")
 
 
-def require_label(policy: str, fields: frozenset[str]) -> None:
+def require_label(fields: frozenset[str]) -> None:
     """Check that synthetic scans have labels.
 
     Raises:
@@ -257,7 +247,7 @@ def require_label(policy: str, fields: frozenset[str]) -> None:
     """
     if "label" not in fields:
         raise ConfigError(
-            f"labels={policy!r}, but besides points the synthetic scans only have "
+            "a policy that keeps labels, but besides points the synthetic scans only have "
             f"{sorted(fields) or 'no fields'}",
             "a model or bank with labels",
             "Use labels='none' for an unlabelled pool, 'ignore', 'pseudo' with a teacher, or "

@@ -117,10 +117,9 @@ def _check_arguments(name: str, kind: type, arguments: Any) -> dict[str, Any]:
     try:
         signature(kind).bind(**lowered)
     except TypeError as error:
-        hints = [suggest(word, known) for word in lowered if word not in known]
         raise ConfigError(
             f"labels={name!r}: {error}",
             f"arguments {', '.join(known)}" if known else "no arguments",
-            "".join(hints[:1]),
+            "".join(suggest(word, known) for word in lowered if word not in known),
         ) from error
     return lowered
