@@ -100,3 +100,14 @@ def test_the_next_epochs_ratio_may_change() -> None:
     """What is still to come is not part of a state."""
     state = make_state(mixed(ratio=[0.25, 0.25], epoch_size=16).mixture, 0, 8)
     batches(mixed(ratio=[0.25, 0.5], epoch_size=16)).load_state_dict(state)
+
+
+def test_a_schedule_of_unrelated_shares_has_states_for_ever() -> None:
+    """The exact sum of its shares has ever more digits."""
+    train = mixed(50, lambda epoch: 0.9 * 0.995**epoch, epoch_size="replace")
+    plans = [train.plan(epoch) for epoch in (1299, 1499, 1500)]
+    assert all(len(plan.hash) == 64 for plan in plans)
+    assert plans[2].before == tuple(
+        before + count
+        for before, count in zip(plans[1].before, plans[1].counts, strict=True)
+    )

@@ -14,10 +14,10 @@ m samples and the source of sample m follow from m alone.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property, lru_cache
-from itertools import takewhile
 from math import ceil
 from typing import Any, Literal, TypeVar
 
@@ -34,6 +34,7 @@ often, all equally); ``"replace"`` has as many samples as there are real scans, 
 synthetic; a number is the length itself."""
 
 _FINEST = 2**30  # largest denominator of a source's share: products stay within 64 bits
+_LONGEST = 10**4200  # largest denominator of a sum: Python writes up to 4300 digits
 # Number of epochs of a changing schedule that determine lengths of epochs and laps.
 _FIRST_EPOCHS = 100
 
@@ -88,9 +89,7 @@ class Mixture:
 
     def __post_init__(self) -> None:
         size = self.epoch_size
-        if size not in ("add", "replace") and not (
-            isinstance(size, int) and not isinstance(size, bool) and size > 0
-        ):
+        if size not in ("add", "replace") and not (type(size) is int and size > 0):
             raise ConfigError(
                 f"epoch_size={size!r}", "'add', 'replace' or a number of samples"
             )
@@ -180,14 +179,12 @@ class Mixture:
             *range(_FIRST_EPOCHS if last is None else min(last, _FIRST_EPOCHS)),
             last or 0,
         ]
-        return tuple(takewhile(self._has_ratio, epochs))
-
-    def _has_ratio(self, epoch: int) -> bool:
-        try:
-            share_of(self.ratio, epoch)
-        except ConfigError:
-            return False
-        return True
+        found = []
+        with suppress(ConfigError):  # the schedule ends
+            for epoch in epochs:
+                share_of(self.ratio, epoch)
+                found.append(epoch)
+        return tuple(found)
 
     @cached_property
     def _sums(self) -> dict[int, Fraction]:
@@ -226,7 +223,8 @@ def synthetic_before(mixture: Mixture, epoch: int) -> Fraction:
     changing = epoch if same_from is None else min(epoch, same_from)
     sums = mixture._sums
     for earlier in range(len(sums) - 1, changing):
-        sums[earlier + 1] = sums[earlier] + exact_synthetic(mixture, earlier)
+        total = sums[earlier] + exact_synthetic(mixture, earlier)
+        sums[earlier + 1] = total.limit_denominator(_LONGEST)
     total = sums[changing]
     if epoch == changing:
         return total
