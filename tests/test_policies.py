@@ -91,3 +91,13 @@ def test_an_unlabelled_pool_makes_batches_by_name_and_as_an_object() -> None:
     for labels in ("none", {"none": {}}, RemoveLabels()):
         train = MixedScans(None, [cast(), cast()], 1, labels, epoch_size=2)
         assert (train.collate([train[0]])["label"] == IGNORE).all()
+
+
+def test_what_cannot_be_pasted_says_why() -> None:
+    real = [cast([car(8, 2)])]
+    with pytest.raises(ConfigError, match=r"count=.*of .*\(\['Car'\]\)"):
+        make_policy(PasteObjects(count={"Van": 2}), real=real, fields=FIELDS)
+    real[0].reflectance = real[0].reflectance * 253 + 2
+    with pytest.raises(ConfigError) as caught:
+        make_policy("paste", real=real, fields=FIELDS)
+    assert "; expected 0 to 1. bank=" in str(caught.value)

@@ -88,6 +88,11 @@ def test_mismatched_shapes_and_invalid_boxes_are_refused() -> None:
         Scan(scan.points[:, :2], scan.reflectance, scan.sensor)
     with pytest.raises(DataError, match=r"label has shape \(9,\)"):
         Scan(scan.points, scan.reflectance, scan.sensor, label=scan.label[:9])
+    for wrong in ((3, 9), (7, 9), (14,)):
+        with pytest.raises(
+            DataError, match=r"boxes of the shape .*; expected \(M, 7\)"
+        ):
+            Boxes(np.ones(wrong, np.float32), ("Car",) * 3)
     with pytest.raises(DataError, match="2 names for 1 boxes"):
         Boxes(boxes(1).values, ("Car", "Car"))
     with pytest.raises(DataError, match="not positive"):

@@ -83,7 +83,10 @@ class Boxes:
     )
 
     def __post_init__(self) -> None:
-        self.values = np.asarray(self.values, np.float32).reshape(-1, 7)
+        given = np.asarray(self.values, np.float32)
+        if given.size and given.shape[-1:] != (7,):
+            raise DataError(f"boxes of the shape {given.shape}", "(M, 7)")
+        self.values = given.reshape(-1, 7)
         self.names = tuple(self.names)
         count = len(self.values)
         for name, shape, dtype, unknown in (

@@ -97,7 +97,7 @@ class PasteObjects:
         """
         check_own(self.threshold, fields)
         if self.clear == "same":
-            require_label("paste", fields)
+            require_label(fields)
         bound = self
         if self.bank is None:
             bound = replace(self, bank=_collect_objects(real, self.least))
@@ -163,7 +163,7 @@ class PasteObjects:
             if not fits.any():
                 raise ConfigError(
                     f"count={self.count}, least={self.least}",
-                    f"names and points of {bank} ({sorted(set(names))})",
+                    f"names and points of {bank} ({sorted(set(bank.boxes.names))})",
                 )
             groups.append((np.flatnonzero(fits), number))
         return groups
@@ -366,7 +366,6 @@ def _collect_objects(real: Source | None, least: int) -> ObjectBank:
     except DataError as error:
         raise ConfigError(
             f"labels='paste': {error}",
-            "real scans with boxes, or bank=",
-            "ObjectBank.from_scans(source).save(path) makes a bank of objects; KITTI and the "
-            "town have boxes.",
+            hint="bank= gives other objects: ObjectBank.from_scans(source).save(path) makes one; "
+            "KITTI and the town have boxes.",
         ) from error
