@@ -2,6 +2,7 @@
 sensors are accepted."""
 
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -242,6 +243,18 @@ def test_check_mix_shows_both_and_names_mistakes(tmp_path: Path) -> None:
         "8 road",
     ):
         assert line in done.output
+    trained = settings.read_text()
+    for wrong, message in {
+        "ratio: 1.5": "ratio 1.5 in epoch 0",
+        "epochs: 3": "3 epochs.*at least 4",
+        "ratio: 0": "without synthetic scans",
+    }.items():
+        settings.write_text(trained.replace("ratio: 0.1", wrong))
+        done = CliRunner().invoke(app, arguments)
+        assert re.search(message, str(done.exception)), wrong
+    for late in ("ratio: {0: 0.0, 3: 0.5}", "epochs: 8"):
+        settings.write_text(trained.replace("ratio: 0.1", late))
+        assert CliRunner().invoke(app, arguments).exception is None
     upside_down = [
         replace(scan, points=scan.points * np.float32([1, 1, -1]))
         for scan in streets(2)

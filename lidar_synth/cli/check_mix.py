@@ -44,6 +44,7 @@ def check_mix(
     Examples:
       lidar-synth check-mix mix.yaml kitti/ --out mix.png
     """
+    from lidar_synth.errors import ConfigError
     from lidar_synth.formats import open_scans
     from lidar_synth.geometry.scan import spread
     from lidar_synth.mixing.compare import USUAL_IGNORE, report
@@ -60,11 +61,15 @@ def check_mix(
     if out is not None:
         view_suffix(out)
     source = open_scans(real, sensor=sensor)
-    settings = read_settings(mix) | {"ratio": 0.5}
+    settings = read_settings(mix)
     # Ids of the trainer's files; here both kinds have train ids.
     settings.pop("classes", None)
     mixture = make_mixture(len(source), settings, weighs=True)
+    epoch = next((e for e in range(100) if mixture.plan(e).synthetics), 0)
+    mixture.set_epoch(epoch)
     chosen = [i for i in range(len(mixture)) if mixture.domain(i)][:count]
+    if not chosen:
+        raise ConfigError("a mixture without synthetic scans", "a ratio above 0")
     kinds: list[list[Scan]] = [
         [source[i] for i in spread(range(len(source)), count)],
         [mixture[i] for i in chosen],
