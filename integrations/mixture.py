@@ -116,7 +116,7 @@ def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:
     if isinstance(policy, RemoveLabels | IgnoreLabels):
         raise ConfigError(
             f"labels={settings['labels']!r} for {trainer}",
-            "labels for every synthetic scan, such as 'generated', 'condition' or 'polarmix'",
+            "labels for every synthetic scan, such as 'generated' or 'condition'",
             "The trainer makes its own batches; a batch of only synthetic scans would have no "
             "valid label, and its loss, a mean over no label, is NaN.",
         )
@@ -137,7 +137,7 @@ def class_ids(scan: Scan, table: NDArray[Any]) -> NDArray[Any]:
         raise DataError(
             f"synthetic scan {scan.id!r} has no valid label",
             "at least one, or the loss of a batch can be NaN",
-            "Use a model or bank with labels, or labels='polarmix' with real scans.",
+            "Use a model or bank with labels.",
         )
     ids: NDArray[Any] = table[scan.label]
     return ids
