@@ -13,6 +13,7 @@ from streets import kitti, street
 from torch.utils.data import DataLoader, Subset
 
 from lidar_synth import mix
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, KITTIObject, open_scans
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
@@ -112,18 +113,61 @@ def test_unlabelled_real_scans_of_a_detector_are_not(
     assert not logged(train, caplog)
 
 
+@pytest.mark.parametrize("labels", ["boxes", "paste"])
 def test_real_scans_whose_boxes_are_not_known_are_for_a_detector(
+    labels: str,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     real = [street(i) for i in range(4)]
     real[1] = replace(real[1], boxes=None)
     options: dict[str, Any] = {"epoch_size": 8, "augment": None}
     assert not logged(MixedScans(real, [street(9)], 0.25, **options), caplog)
-    [message] = logged(MixedScans(real, [street(9)], 0.25, "boxes", **options), caplog)
+    [message] = logged(MixedScans(real, [street(9)], 0.25, labels, **options), caplog)
     assert repr(real[1].id) in message and "Subset(scans" in message
     known = Subset(real, [i for i, scan in enumerate(real) if scan.boxes is not None])
     caplog.clear()
-    assert not logged(MixedScans(known, [street(9)], 0.25, "boxes", **options), caplog)
+    assert not logged(MixedScans(known, [street(9)], 0.25, labels, **options), caplog)
+
+
+@pytest.mark.parametrize("mixes", ["lasermix", "polarmix_or_lasermix"])
+def test_an_augmentation_that_removes_boxes_is_refused_for_a_detector(
+    mixes: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    real = [street(i) for i in range(2)]
+    options: dict[str, Any] = {"augment": mixes, "augment_real": True, "epoch_size": 8}
+    for labels in ("boxes", "paste"):
+        train = MixedScans(real, [street(9)], 0.5, labels, **options)
+        with pytest.raises(ConfigError, match="augment= that removes the boxes of"):
+            logged(train, caplog)
+    recipe = mix(real, [street(9)], task="detection", epochs=8, augment=mixes)
+    with pytest.raises(ConfigError, match="augment= that removes the boxes of"):
+        logged(recipe, caplog)
+    caplog.clear()
+    [message] = logged(MixedScans(real, [street(9)], 0.5, **options), caplog)
+    assert "augment= removes boxes" in message
+
+
+def test_names_that_differ_by_capitals_are(caplog: pytest.LogCaptureFixture) -> None:
+    real = [street(i) for i in range(4)]
+    for scan in real:
+        assert scan.boxes is not None
+        lower = tuple(map(str.lower, scan.boxes.names))
+        scan.boxes = replace(scan.boxes, names=lower)
+    [message] = logged(MixedScans(real, [street(9)], 0.25, "boxes"), caplog)
+    assert "'Car'" in message and "'car'" in message and "by capitals" in message
+
+
+def test_real_scans_that_are_not_finite_are_refused_or_reported(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    real = Scans("r", 4)
+    nan = np.full_like(real[0].reflectance, np.nan)
+    real[0] = replace(real[0], reflectance=nan)
+    [message] = logged(MixedScans(real, Endless(), 0.5), caplog)
+    assert "'r0' has reflectances up to nan" in message
+    real[0] = replace(real[0], points=real[0].points * np.float32(np.nan))
+    with pytest.raises(DataError, match="'r0' with points that are NaN"):
+        logged(MixedScans(real, Endless(), 0.5), caplog)
 
 
 def test_points_outside_of_the_view_that_has_boxes_are(

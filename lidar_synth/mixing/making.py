@@ -7,10 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Scan
+from lidar_synth.geometry.scan import (
+    POINT_FIELDS,
+    REAL,
+    SYNTHETIC,
+    Scan,
+    require_finite,
+)
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.labels.own import KeepBoxes, RemoveLabels
-from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
+from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy, read_policy
 from lidar_synth.mixing.items import copy_scan
 from lidar_synth.mixing.notices import Notices
 
@@ -55,9 +61,12 @@ class SampleMaker:
         fields = [source.fields | rings for source in sources]
         self._transfer = transfer
         self._policies = [make_policy(labels, real=scans, fields=f) for f in fields]
-        policies = set(map(type, self._policies))
-        self.removes_labels = RemoveLabels in policies
-        self._notices = Notices(images, KeepBoxes in policies)
+        policy = read_policy(labels)
+        self.removes_labels = isinstance(policy, RemoveLabels)
+        boxes = isinstance(policy, KeepBoxes)
+        # Pasted objects with "same" are for a segmenter.
+        boxed = boxes or getattr(policy, "clear", "same") != "same"
+        self._notices = Notices(images, boxes, boxed)
         self._without_unboxed = _make_handling(unboxed)
         common = frozenset({*POINT_FIELDS, "boxes"}).intersection(*fields)
         self._augment = _make_augment(augment, scans, common)
@@ -66,12 +75,13 @@ class SampleMaker:
 
     def real(self, scan: Scan, rng: np.random.Generator) -> Any:
         """The sample of a real scan."""
+        require_finite(scan)
         self._notices.real(scan)
         # Copied, as a source may keep its scans in memory. Scans of the town count as real here.
         scan = replace(copy_scan(scan), domain=REAL)
-        if self._augment is not None and self._augment_real:
+        if self._augment_real:
             # A scan with pasted objects is synthetic elsewhere.
-            scan = replace(self._augment(scan, rng), domain=REAL)
+            scan = replace(self._augmented(scan, rng), domain=REAL)
         return self._to_sample(scan, rng)
 
     def synthetic(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
@@ -84,10 +94,17 @@ class SampleMaker:
         self._notices.synthetic(given, scan)
         if scan.boxes is not None:
             scan = self._without_unboxed(scan)
-        if self._augment is not None:
-            scan = self._augment(scan, rng)
+        scan = self._augmented(scan, rng)
         # A policy or an augmentation of the user's may make a new scan, which is real by default.
         return self._to_sample(replace(scan, domain=SYNTHETIC), rng)
+
+    def _augmented(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        if self._augment is None:
+            return scan
+        changed = self._augment(scan, rng)
+        if scan.boxes is not None and changed.boxes is None:
+            self._notices.lost_boxes(scan)
+        return changed
 
 
 def make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":

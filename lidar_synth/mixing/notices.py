@@ -10,6 +10,7 @@ from statistics import median
 from torch.utils.data import get_worker_info
 
 from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing.meaning import OTHER_SIZE
 from lidar_synth.mixing.plan import MixingPlan
@@ -46,23 +47,28 @@ class Notices:
     Args:
         images: whether batches are range images, in which the number of points has no meaning.
         boxes: whether scans are mixed for their boxes, so that real ones need no labels.
+        boxed: whether synthetic scans are to have boxes.
     """
 
-    def __init__(self, images: bool = False, boxes: bool = False) -> None:
-        self._real_boxes = self._told = self._scale_told = False
+    def __init__(
+        self, images: bool = False, boxes: bool = False, boxed: bool = False
+    ) -> None:
+        self._real_boxes = boxes  # whether real scans have boxes, or should
+        self._told: set[str] = set()
+        self._names: set[str] = set()  # of all boxes
+        self._boxed = boxed
+        self._measured = False
         # a real scan without labels; "" if that is no matter, or told
         self._unlabelled: str | None = "" if boxes else None
-        self._wants_boxes = boxes
         self._labelled = False  # whether a synthetic scan had labels
         self._images = images
         # points of real and of synthetic scans
         self._sizes: tuple[list[int], list[int]] = ([], [])
 
     def real(self, scan: Scan) -> None:
-        """Report a reflectance above 1; note whether real scans have boxes and labels, and their
-        numbers of points."""
-        if not self._scale_told and (scan.reflectance > 1).any():
-            self._scale_told = True
+        """Report a reflectance above 1 or NaN, and boxes that are not known; note whether real
+        scans have boxes and labels, and their numbers of points."""
+        if not (scan.reflectance <= 1).all():
             self._warn(
                 "real scan %r has reflectances up to %g, synthetic ones up to 1: the scale tells "
                 "them apart. Divide them where the Scan is made, intensities of 0 to 255 by 255.",
@@ -70,8 +76,7 @@ class Notices:
                 scan.reflectance.max(),
             )
         self._real_boxes |= scan.boxes is not None
-        if self._wants_boxes and scan.boxes is None:
-            self._wants_boxes = False
+        if self._boxed and self._real_boxes and scan.boxes is None:
             self._warn(
                 "the boxes of real scan %r are not known (scan.boxes is None): a detector would "
                 "learn that its objects are background. Leave such scans out: "
@@ -86,8 +91,16 @@ class Notices:
         self._count(0, scan)
 
     def _count(self, kind: int, scan: Scan) -> None:
-        """Compare the numbers of points of the first scans, and labelled synthetic scans with
-        unlabelled real ones."""
+        """Compare the numbers of points of the first scans, labelled synthetic scans with
+        unlabelled real ones, and the names of boxes."""
+        if scan.boxes is not None:
+            self._names |= set(scan.boxes.names)
+            if len({name.lower() for name in self._names}) < len(self._names):
+                self._warn(
+                    "boxes have the names %s: a detector would take those that differ by capitals "
+                    "for several classes, or miss some. Give real and synthetic ones the same.",
+                    sorted(self._names),
+                )
         if self._labelled and self._unlabelled is not None:
             self._warn(
                 "real scan %r has no labels: all its points are 255 = ignore, and only synthetic "
@@ -95,8 +108,6 @@ class Notices:
                 "labels of KITTI-360), or leave it out.",
                 self._unlabelled,
             )
-            self._labelled = False
-            self._unlabelled = ""
         if self._images or len(self._sizes[kind]) >= FEW:
             return
         self._sizes[kind].append(len(scan))
@@ -107,15 +118,31 @@ class Notices:
             if max(ours, theirs) > OTHER_SIZE * min(ours, theirs):
                 self._warn(
                     "a real scan has %d points, a synthetic one %d, on the same nominal grid: the "
-                    "density tells them apart. Give load_generator columns= of that density, or "
-                    "use as_sensor= or collate='range'.",
+                    "density tells them apart. Give load_generator columns= of that density, "
+                    "as_sensor= a sensor of it, or use collate='range'.",
                     theirs,
                     ours,
                 )
 
     def _warn(self, message: str, *values: object) -> None:
-        if _is_first():
+        """Log a warning, unless it has been logged."""
+        if message not in self._told and _is_first():
             log.warning(message, *values)
+        self._told.add(message)
+
+    def lost_boxes(self, scan: Scan) -> None:
+        """Report that the augmentation has removed the boxes of a scan.
+
+        Raises:
+            ConfigError: if synthetic scans are to have boxes.
+        """
+        if self._boxed:
+            raise ConfigError(
+                f"augment= that removes the boxes of scan {scan.id!r}",
+                "one that keeps them, with labels='boxes' or 'paste'",
+                "For a segmenter, {'paste': {'clear': 'same'}} gives scans without boxes none.",
+            )
+        self._warn("augment= removes boxes, of which a detector learns")
 
     def synthetic(self, given: Scan, scan: Scan) -> None:
         """Report the unboxed objects of a synthetic scan, or that synthetic scans have no boxes
@@ -128,23 +155,20 @@ class Notices:
         if scan.label is not None and self._unlabelled != "":
             self._labelled = self._labelled or bool((scan.label != IGNORE).any())
         self._count(1, scan)
-        if self._told or (scan.boxes is None and not self._real_boxes):
-            return
-        self._told = True
-        if not _is_first():
-            return
-        if scan.boxes is None:
-            log.warning(
+        if scan.boxes is None and self._real_boxes:
+            self._warn(
                 "real scans have boxes, synthetic ones have none: a detector would learn that "
                 "their objects are background. For a detector, use labels='paste', or "
                 "labels='boxes' if the scans have boxes."
             )
+        if scan.boxes is None or self._measured:
             return
+        self._measured = True
         from lidar_synth.labels.edit import measure  # loads networks
 
         found = measure([given])
         if found.objects:
-            log.warning(
+            self._warn(
                 "synthetic scan %r: %s, which unboxed='close' removes; only their number is "
                 "reported with unboxed='keep'",
                 given.id,
