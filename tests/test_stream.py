@@ -332,7 +332,7 @@ def test_torchdata_without_end(workers: int, done: int) -> None:
 def test_invalid_options_and_states_of_a_stream_are_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with pytest.raises(ConfigError, match="batch_size=0"):
+    with pytest.raises(ConfigError, match="batch_size 0"):
         MixedStream(mixed(), batch_size=0)
     stream = MixedStream(mixed(), batch_size=4, endless=False)
     with pytest.raises(ConfigError, match="5 batches done of 4"):

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from torch.utils.data import Sampler
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.labels.own import check_count
 from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, CurrentEpoch, Position
 from lidar_synth.mixing.quotas import Mixture
 from lidar_synth.mixing.state import (
@@ -68,9 +69,7 @@ class CutSteps(Sequence[range]):
     def __getitem__(self, number: int) -> range:  # type: ignore[override]  # no slices
         """The positions of a step; the last step takes all remaining positions, even if they exceed
         its size."""
-        if not -self.total <= number < self.total:
-            raise IndexError(f"step {number} of {self.total}")
-        number %= self.total
+        number = range(self.total)[number]
         start = self.start + number * self.size
         return range(start, self.end if number == self.total - 1 else start + self.size)
 
@@ -152,8 +151,7 @@ class MixedBatches(Divided, Sampler[list[int]]):
         world_size: int | None = None,
         drop_last: bool = False,
     ) -> None:
-        if batch_size < 1:
-            raise ConfigError(f"batch_size={batch_size}", "at least 1")
+        check_count("batch_size", batch_size, 1)
         self.dataset = dataset
         self.batch_size = batch_size
         self.drop_last = drop_last
@@ -171,6 +169,11 @@ class MixedBatches(Divided, Sampler[list[int]]):
 
     def __iter__(self) -> Iterator[list[int]]:
         self._check()
+        if not self.steps_from(0):
+            raise ConfigError(
+                f"{len(self.dataset)} samples of an epoch with drop_last=True",
+                f"{self.batch_size * self.world_size} or more: a batch on every rank",
+            )
         steps = self._steps()
         epoch = self.dataset.epoch
         if steps and len(steps[-1]) < self.world_size:

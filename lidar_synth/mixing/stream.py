@@ -8,6 +8,7 @@ from typing import Any
 from torch.utils.data import IterableDataset, get_worker_info
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.labels.own import check_count
 from lidar_synth.mixing.batches import AHEAD, CutSteps, cut_steps, go_to, rank_share
 from lidar_synth.mixing.epochs import check_pass, share, shared_integers
 from lidar_synth.mixing.scans import MixedScans
@@ -71,8 +72,7 @@ class MixedStream(Divided, IterableDataset[Any]):
         rank: int | None = None,
         world_size: int | None = None,
     ) -> None:
-        if batch_size < 1:
-            raise ConfigError(f"batch_size={batch_size}", "at least 1")
+        check_count("batch_size", batch_size, 1)
         self.scans = scans
         self.batch_size = batch_size
         self.endless = endless
