@@ -313,3 +313,46 @@ def test_a_made_up_scan_has_the_fields_of_its_source(name: str) -> None:
         "reflectance",
         "label",
     }
+
+
+@pytest.mark.parametrize("name", ["dict", "tuple"])
+def test_raw_words_beside_classes_are_named(name: str) -> None:
+    def raw(points: np.ndarray, label: np.ndarray) -> Any:
+        points = np.tile(points, (10, 1))
+        words = np.tile(label, 10) + (np.arange(len(points)) << 16)
+        return FORMS[name](points, words)
+
+    with pytest.raises(ConfigError, match="different values instead of.*0xFFFF"):
+        MixedScans.wrap(
+            Theirs(raw, ignored=0), Endless(), 0.5, to_sample=as_sample(FORMS[name], 0)
+        )
+
+
+@pytest.mark.parametrize(
+    "options", [{"loss_weight": 0.1}, {"loss_weight": {0: 1.0, 5: 0.1}}]
+)
+def test_a_weight_without_a_place_in_the_samples_is_refused(
+    options: dict[str, Any],
+) -> None:
+    def weighed(points: np.ndarray, label: np.ndarray) -> Any:
+        return FORMS["dict"](points, label) | {"loss_weight": 1.0}
+
+    for form in (FORMS["dict"], FORMS["tuple"]):
+        wrapped: dict[str, Any] = {"to_sample": as_sample(form)}
+        with pytest.raises(ConfigError, match="loss_weight for samples without"):
+            MixedScans.wrap(Theirs(form), Endless(), 0.5, **wrapped, **options)
+        MixedScans.wrap(Theirs(form), Endless(), 0.5, **wrapped, loss_weight=1)
+        MixedScans.wrap(
+            Theirs(form), Endless(), 0.5, **wrapped, **options, compare=False
+        )
+    MixedScans.wrap(
+        Theirs(weighed), Endless(), 0.5, to_sample=as_sample(weighed), **options
+    )
+
+
+def test_real_samples_of_a_trainer_are_not_augmented() -> None:
+    form = FORMS["dict"]
+    with pytest.raises(ConfigError, match="augment_real=True with wrap"):
+        MixedScans.wrap(
+            Theirs(form), Endless(), 0.5, to_sample=as_sample(form), augment_real=True
+        )

@@ -287,6 +287,30 @@ def test_reflectance_is_dropped_by_chance() -> None:
     assert 70 < sum(dropped) < 130
 
 
+def test_a_ratio_takes_the_place_of_the_recipe_and_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def wrap(**options: Any) -> MixedScans:
+        return MixedScans.wrap(
+            range(8), SYNTHETIC, to_sample=lambda scan, rng: 0, **options
+        )
+
+    for made in (mix(REAL, SYNTHETIC, 0.5, epochs=8), wrap(ratio=0.5, epochs=8)):
+        assert ratios(made) == [0.5] * 8
+        assert caplog.text.count("epochs=8 has no effect beside ratio=0.5") == 1
+        caplog.clear()
+    assert ratios(wrap(epochs=8)) != ratios(wrap()) == [0.25] * 8
+    assert "has no effect" not in caplog.text
+
+
+def test_a_schedule_of_weights_that_is_too_short_is_named_before_the_epoch() -> None:
+    mixed = MixedScans(REAL, SYNTHETIC, 0.5, loss_weight=[1.0, 0.1])
+    mixed.set_epoch(1)
+    with pytest.raises(ConfigError, match="loss_weight=.* in epoch 2; expected"):
+        mixed.set_epoch(2)
+    assert mixed.epoch == 1
+
+
 def test_a_wrapped_dataset_gets_the_recipe_too() -> None:
     """A trainer's settings with ``epochs`` are those of ``mix``, by the number of its samples."""
     few = mix(REAL, SYNTHETIC, epochs=8)

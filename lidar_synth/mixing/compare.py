@@ -66,6 +66,7 @@ def check_alike(
     real: Sequence[Any],
     synthetic: Sequence[Synthetic],
     finish: Callable[[int, Scan, np.random.Generator], Any],
+    weighs: bool = False,
 ) -> None:
     """Compare a trainer's first sample with one synthetic sample of each source, then what several
     samples mean.
@@ -83,6 +84,8 @@ def check_alike(
         real: the trainer's datasets; the first sample of the first one is used.
         synthetic: the sources.
         finish: ``(source, scan, rng) -> sample``, what the mixture does to a scan of a source.
+        weighs: whether samples have weights in the loss, which only a dict with ``loss_weight``
+            gets.
 
     Raises:
         ConfigError: if keys, types, dtypes, ranks or the value for "ignore" differ, or units, axes,
@@ -113,6 +116,12 @@ def check_alike(
                     "the same keys, types, dtypes and ranks, and one value for ignored labels",
                     "Change to_sample, or pass compare=False if the collate function expects "
                     "them to differ.",
+                )
+            if weighs and not (isinstance(sample, dict) and "loss_weight" in sample):
+                raise ConfigError(
+                    "loss_weight for samples without the key loss_weight",
+                    "dicts with it, in which the weight of the plan is written",
+                    "If you multiply by train.loss_weight(i), pass compare=False.",
                 )
             if _tables(expected) and not _is_on_demand(source):
                 _compare_more(dataset, expected, source, make)
@@ -280,10 +289,17 @@ def _parts(value: Any) -> dict[str, Any]:
 def _unknown_values(dataset: Any, real: Any, synthetic: Any) -> Iterator[str]:
     """Describe label values of a synthetic sample that are no class and occur in none of the
     searched real samples."""
-    real_labels = dict(_labels(real))
+    real_labels = dict(_labels(real, np.inf))
     labels = dict(_labels(synthetic))
     for place in [p for p in labels if p in real_labels]:
         known = real_labels[place]
+        if len(known) > FEW:
+            if _may_be_labels(place):
+                yield (
+                    f"{place} has {len(labels[place])} different values instead of {len(known)}: "
+                    "instance ids in the upper bits? `& 0xFFFF`"
+                )
+            continue
         unknown = _not_classes(place, labels[place], known)
         for other in range(1, min(len(dataset), SEARCHED) if unknown else 0):
             known = known | dict(_labels(_try("real", dataset.__getitem__, other))).get(
@@ -308,10 +324,10 @@ def _not_classes(place: str, values: set[int], known: set[int]) -> set[int]:
     return {v for v in values - known if v in USUAL_IGNORE or not low <= v <= high}
 
 
-def _labels(sample: Any) -> Iterator[tuple[str, set[int]]]:
+def _labels(sample: Any, most: float = FEW) -> Iterator[tuple[str, set[int]]]:
     """(place, values) of the integer arrays with few different values, which may be labels."""
     for place, array in _arrays(sample):
-        if array.dtype.kind in "iu" and 0 < len(values := np.unique(array)) <= FEW:
+        if array.dtype.kind in "iu" and 0 < len(values := np.unique(array)) <= most:
             yield place, set(values.tolist())
 
 

@@ -11,25 +11,28 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.mixing.schedules import Schedule, make_schedule
+from lidar_synth.mixing.schedules import Schedule, make_schedule, share_of
 
 Forward = Callable[[nn.Module, Any], Any]
 
 
-def make_weight(given: Any) -> Schedule:
+def make_weight(given: Any, epoch: int = 0) -> Schedule:
     """The weight of synthetic samples in the loss, by epoch.
 
     Args:
         given: a number from 0 to 1, or one by epoch, as a ratio (``make_schedule``).
+        epoch: one that must have a weight.
 
     Raises:
         ConfigError: on anything else.
     """
     try:
-        return make_schedule(given)
+        schedule = make_schedule(given)
+        share_of(schedule, epoch)
+        return schedule
     except ConfigError as error:
         raise ConfigError(
-            f"loss_weight={given!r}",
+            f"loss_weight={given!r} in epoch {epoch}",
             "the weight of synthetic samples in the loss, from 0 to 1, or one by epoch, such as "
             "{0: 1.0, 10: 0.1}",
         ) from error

@@ -157,6 +157,14 @@ class MixedScans(Dataset[Any]):
     ) -> None:
         reals = each(real)
         seed = to_integer(seed, "seed")
+        if augment_real and real_as_is:
+            raise ConfigError(
+                "augment_real=True with wrap, which passes real samples on unchanged",
+                "augment_real=False",
+                "Augment real samples in your dataset.",
+            )
+        if not isinstance(epoch_size, str):
+            epoch_size = to_integer(epoch_size, "epoch_size")
         if locality not in (None, "shard"):
             raise ConfigError(f"locality={locality!r}", '"shard", or None')
         _check_lengths(reals)
@@ -184,7 +192,12 @@ class MixedScans(Dataset[Any]):
             reuse,
             balanced or locality is not None,
         )
-        sensors = self._sensors(transfer)
+        kept = () if real_as_is else self.real
+        target = None if transfer is None else transfer.target
+        sensors = check_together(
+            (*kept, *self.synthetic),
+            [None] * len(kept) + [target] * len(self.synthetic),
+        )
         self._maker = SampleMaker(
             self.synthetic,
             None if real_as_is else real,
@@ -209,14 +222,9 @@ class MixedScans(Dataset[Any]):
         self.set_epoch(0)
         self._untold = self._take_earlier()
         if real_as_is and compare:
-            check_alike(self.real, self.synthetic, self._maker.synthetic)
-
-    def _sensors(self, transfer: "Transfer | None") -> list[Sensor]:
-        """The sensors of the scans, which fit together."""
-        real = () if self._real_as_is else self.real
-        target = None if transfer is None else transfer.target
-        targets = [None] * len(real) + [target] * len(self.synthetic)
-        return check_together((*real, *self.synthetic), targets)
+            weights = {*self._loss_weights, self.synthetic_weight}
+            weighs = weights != {1, make_weight(1)}
+            check_alike(self.real, self.synthetic, self._maker.synthetic, weighs)
 
     def _take_earlier(self) -> bool:
         """Take the pass of the latest mixture with the same plan, if there is one."""
@@ -328,9 +336,10 @@ class MixedScans(Dataset[Any]):
         finishes the epoch in which it began.
 
         Raises:
-            ConfigError: on an epoch for which there is no ratio.
+            ConfigError: on an epoch for which there is no ratio or no weight.
         """
         MixingPlan(self.mixture, epoch)
+        make_weight(self.synthetic_weight, epoch)
         if self._untold:
             self._untold = False
             self.current.forget_pass()
@@ -399,11 +408,7 @@ class MixedScans(Dataset[Any]):
         return self.mixture.length
 
     def __getitem__(self, index: int) -> Any:
-        epoch = self.epoch_of(index)
-        length = len(self)
-        if not -length <= index < length:
-            raise IndexError(f"sample {index} of {length}")
-        return self.sample(epoch, int(index) % length)
+        return self.sample(self.epoch_of(index), range(len(self))[index])
 
     def domain(self, index: int) -> int:
         """The domain of the sample at ``index`` in the current epoch: 0 = real, 1 = synthetic.
@@ -434,7 +439,7 @@ class MixedScans(Dataset[Any]):
     def _planned_at(self, index: int) -> tuple[MixingPlan, int]:
         """The plan and the position in it of an index, which may count from the end."""
         plan = self.plan(index.epoch if isinstance(index, Position) else None)
-        return plan, index if index >= 0 else index + len(plan)
+        return plan, range(len(plan))[index]
 
     def _weight_of(self, plan: MixingPlan, position: int) -> float:
         source = plan[position][0]
