@@ -163,8 +163,27 @@ def test_the_epoch_of_the_mixture_counts() -> None:
 
 
 def test_bad_sizes_are_refused() -> None:
-    with pytest.raises(ConfigError, match="batch_size=0"):
+    with pytest.raises(ConfigError, match="batch_size 0"):
         mixture().loader(batch_size=0)
+    for wrong in ("4", 4.0):
+        with pytest.raises(ConfigError, match="batch_size .*; expected a whole number"):
+            mixture().loader(batch_size=wrong)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="epoch_size=4.5; expected an integer"):
+        MixedScans(Scans("r", 4), Endless(), 0.5, epoch_size=4.5)  # type: ignore[arg-type]
+
+
+def test_sizes_of_numpy_are_taken() -> None:
+    train = MixedScans(Scans("r", 4), Endless(), 0.5, epoch_size=np.int64(6))  # type: ignore[arg-type]
+    assert len(train.loader(batch_size=np.int64(2))) == 3  # type: ignore[arg-type]
+    assert train.plan().hash
+
+
+def test_an_epoch_without_a_whole_batch_is_refused() -> None:
+    train = mixture()
+    loader = train.loader(batch_size=len(train) + 1, drop_last=True)
+    with pytest.raises(ConfigError, match="18 samples .*drop_last=True; expected 19"):
+        next(iter(loader))
+    assert len(list(train.loader(batch_size=len(train), drop_last=True))) == 1
 
 
 def test_batches_in_another_order_are_refused() -> None:

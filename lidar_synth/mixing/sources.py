@@ -55,13 +55,9 @@ class Sources:
             )
         )
         self.sources = sources
-        plain = (
-            None
-            if weights is None
-            else [w.item() if isinstance(w, np.generic) else w for w in weights]
-        )
-        self.weights: tuple[float | None, ...] = (
-            (None,) * len(sources) if plain is None else tuple(plain)
+        self.weights: tuple[float | None, ...] = tuple(
+            w.item() if isinstance(w, np.generic) else w
+            for w in ([None] * len(sources) if weights is None else weights)
         )
 
     def __len__(self) -> int:
@@ -108,7 +104,7 @@ def sensor_of(source: Any) -> Sensor:
     first = source[0]
     if not isinstance(first, Scan):
         raise ConfigError(
-            f"real samples of the type {type(first).__name__}",
+            f"samples of the type {type(first).__name__}",
             "scans",
             "MixedScans.wrap(dataset, synth, to_sample=...) takes a trainer's own dataset.",
         )
