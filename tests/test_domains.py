@@ -2,6 +2,7 @@
 scans, statistics and layers by domain."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -295,8 +296,8 @@ def test_a_ratio_takes_the_place_of_the_recipe_and_says_so(
             range(8), SYNTHETIC, to_sample=lambda scan, rng: 0, **options
         )
 
-    for made in (mix(REAL, SYNTHETIC, 0.5, epochs=8), wrap(ratio=0.5, epochs=8)):
-        assert ratios(made) == [0.5] * 8
+    for make in (partial(mix, REAL, SYNTHETIC), wrap):
+        assert ratios(make(ratio=0.5, epochs=8)) == [0.5] * 8
         assert caplog.text.count("epochs=8 has no effect beside ratio=0.5") == 1
         caplog.clear()
     assert ratios(wrap(epochs=8)) != ratios(wrap()) == [0.25] * 8
