@@ -6,7 +6,6 @@ once for each scan.
 """
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.making import claim_bank
 from lidar_synth.bake.verify import check_scans
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
-from lidar_synth.files.disk import part_of, sync_folder
+from lidar_synth.bank.folder import LocalFolder
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.transfer import Transfer
@@ -71,19 +70,15 @@ def _shard(
     path = out / entry.file
     if not path.is_file() or next(check_scans(path, facts, entry), None) is not None:
         shard = bank.shard(number)
-        part = part_of(path)
         names = [
             name for p in range(entry.scans) if (name := shard.condition(p)) is not None
         ]
-        try:
+        folder = LocalFolder(out)
+        with folder.making(entry.file) as part:
             with ShardWriter(part, facts, entry, conditions=names) as writer:
                 for image in _images(bank, number, transfer):
                     writer.append(image)
-            part.replace(path)
-        finally:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
-        sync_folder(out)
+            folder.put(part, entry.file)
     return entry.measure(path)
 
 

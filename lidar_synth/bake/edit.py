@@ -23,8 +23,8 @@ from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.making import claim_bank
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader, ShardWriter
 from lidar_synth.bank.folder import LocalFolder, copy_shard
-from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files.disk import hash_of_names, part_of
+from lidar_synth.errors import ConfigError
+from lidar_synth.files.disk import hash_of_names, unwritable
 
 
 def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
@@ -212,9 +212,8 @@ def _copy_part(
 ) -> Entry:
     """Write the kept scans ``first`` to ``last`` - 1 of a shard as the shard ``entry.file`` of
     another bank."""
-    path = out / entry.file
     if (first, last) == (0, entry.kept):
-        _link(bank, bank.index.shards[number], path)
+        _link(bank, bank.index.shards[number], out / entry.file)
         return entry
     # A file holds consecutive scans: dropped ones in between are copied too, and stay dropped.
     start = entry.position(first)
@@ -225,10 +224,11 @@ def _copy_part(
     entry = replace(
         entry, first=entry.first + start, scans=stop - start, dropped=dropped
     )
-    part = part_of(path)
-    _copy_scans(bank.shard(number), range(start, stop), entry, part)
-    entry = entry.measure(part)
-    part.replace(path)
+    folder = LocalFolder(out)
+    with folder.making(entry.file) as part:
+        _copy_scans(bank.shard(number), range(start, stop), entry, part)
+        entry = entry.measure(part)
+        folder.put(part, entry.file)
     return entry
 
 
@@ -242,12 +242,13 @@ def _copy_scans(shard: ShardReader, positions: range, entry: Entry, path: Path) 
 
 def _link(bank: Bank, entry: Entry, path: Path) -> None:
     """Hard-link a shard; copy it where the file system has no hard links, or from a URL."""
-    with LocalFolder(path.parent).making(path.name) as part:
+    folder = LocalFolder(path.parent)
+    with folder.making(path.name) as part:
         if isinstance(bank.root, str):
             copy_shard(bank.root, entry, part)
         else:
             _link_file(bank.root / entry.file, part)
-        part.replace(path)
+        folder.put(part, path.name)
 
 
 def _link_file(source: Path, path: Path) -> None:
@@ -257,9 +258,7 @@ def _link_file(source: Path, path: Path) -> None:
         try:
             shutil.copyfile(source, path)
         except OSError as error:
-            raise FileError(
-                f"{path} cannot be written ({error.strerror})", "a disk with free space"
-            ) from error
+            raise unwritable(path, error) from error
 
 
 @contextmanager
