@@ -536,9 +536,9 @@ def test_invalid_edits_are_refused(root: Path, tmp_path: Path) -> None:
                 {tmp_path / name: share for name, share in shares.items()},
                 progress=False,
             )
-    for part in ("train", "train=much", "=0.5"):
+    for part in ("train", "train=much", "=0.5", "q/=0.5"):
         with pytest.raises(ConfigError, match=f"part '{part}'; expected FOLDER=SHARE"):
-            call("bank", "split", root, part)
+            call("bank", "split", root, "q=0.5", part)
     (tmp_path / "file").touch()
     with pytest.raises(FileError, match=r"file.\.made\.json cannot be written"):
         head(Bank(root), 2, tmp_path / "file", progress=False)

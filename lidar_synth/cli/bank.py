@@ -1,5 +1,6 @@
 """``lidar-synth verify``, ``repair``, ``info`` and ``bank``: maintenance of banks."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -168,17 +169,15 @@ def split(
     from lidar_synth.bank import Bank
     from lidar_synth.errors import ConfigError
 
-    shares = {}
-    for part in parts:
+    shares: dict[Path, float] = {}
+    for count, part in enumerate(parts):
         folder, _, share = part.rpartition("=")
-        try:
+        with suppress(ValueError):
             shares[local_path(folder)] = float(share)
-        except ValueError as error:
+        if not folder or len(shares) == count:
             raise ConfigError(
-                f"part {part!r}", "FOLDER=SHARE, such as train=0.9"
-            ) from error
-        if not folder:
-            raise ConfigError(f"part {part!r}", "FOLDER=SHARE, such as train=0.9")
+                f"part {part!r}", "FOLDER=SHARE, such as train=0.9, each folder once"
+            )
     for out, index in run(Bank(bank), shares).items():
         typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
 
