@@ -4,6 +4,7 @@ every scan."""
 import json
 import os
 import re
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -156,9 +157,13 @@ def test_a_damaged_scan_is_named(root: Path) -> None:
 
 
 def test_unlisted_shards_are_found(root: Path) -> None:
-    shutil.copyfile(root / "shard-00000.h5", root / "shard-00009.h5")
-    [problem] = verify(root, progress=False)
-    assert (problem.file, problem.what) == ("shard-00009.h5", "is not in the index")
+    root = root.rename(root.with_name("a bank"))
+    extra = Path(shutil.copyfile(root / "shard-00000.h5", root / "shard-00009.h5"))
+    status, output = call("verify", root)
+    assert status == 1 and f"{extra.name}: is not in the index: remove it" in output
+    assert "lidar-synth repair" not in output
+    (root / "README.md").unlink()
+    assert f"lidar-synth repair {shlex.quote(str(root))} " in call("verify", root)[1]
 
 
 SIDE = ["README.md", "croissant.json", SETTINGS]

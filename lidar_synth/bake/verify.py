@@ -25,6 +25,9 @@ AGREE = 0.9
 all cells agree; on others rounding changes a few ranges and labels; a scan of another seed agrees
 in few cells."""
 
+UNLISTED = "is not in the index: remove it"
+"""The problem of a shard that no repair can mend."""
+
 SIDE_FILES = CARD, CROISSANT, SETTINGS
 """The other files of a bank, which can be rewritten from the index."""
 
@@ -75,7 +78,7 @@ def verify(root: str | Path, progress: bool = True) -> list[Problem]:
     return (
         problems
         + [
-            Problem(name, "is not in the index")
+            Problem(name, UNLISTED)
             for name in sorted(shards - index.by_file.keys())
         ]
         + check_side_files(folder, index)

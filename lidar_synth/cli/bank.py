@@ -50,18 +50,18 @@ def verify(
       lidar-synth verify bank --deep --sample 100 --seed 7
     """
     import secrets
+    from shlex import quote
 
-    from lidar_synth.bake.verify import AGREE, regenerate
+    from lidar_synth.bake.verify import AGREE, UNLISTED, regenerate
     from lidar_synth.bake.verify import verify as run
 
     problems = run(bank)
     for problem in problems:
         typer.echo(f"{problem.file}: {problem.what}", err=True)
     if problems:
-        typer.echo(
-            f"{bank}: {len(problems)} problems. lidar-synth repair {bank} regenerates what is "
-            "damaged."
-        )
+        typer.echo(f"{bank}: {len(problems)} problems")
+        if any(problem.what != UNLISTED for problem in problems):
+            typer.echo(f"lidar-synth repair {quote(bank)} regenerates what is damaged.")
         raise typer.Exit(1)
     typer.echo(f"{bank}: intact")
     if not deep:
