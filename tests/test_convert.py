@@ -17,9 +17,10 @@ from typer.testing import CliRunner
 
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files.claims import claim
 from lidar_synth.formats import READERS, WRITERS, open_scans
 from lidar_synth.formats.as_sensor import AsSensor
-from lidar_synth.formats.convert import SETTINGS, Report, convert, reproject
+from lidar_synth.formats.convert import SETTINGS, Report, _settings, convert, reproject
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor, presets
@@ -424,11 +425,10 @@ def test_other_options_of_the_reader_do_not_keep_the_old_scans(tmp_path: Path) -
         convert(open_scans(tmp_path / "in", reflectance_max=255), out, progress=False)
     target = load_sensor("vlp16")
     mistaken = open_scans(tmp_path / "in", reflectance_max=255, sensor="vlp16")
-    changed.root.mkdir()
-    changed.path(
-        0, "a"
-    ).touch()  # as if it could be written: these points are no streets
-    convert(mistaken, changed, as_sensor=target, progress=False)
+    claim(
+        changed.root / SETTINGS,
+        _settings(mistaken, changed, AsSensor(Transfer(target)), False),
+    )
     with pytest.raises(ConfigError, match="was filled with"):
         convert(
             open_scans(tmp_path / "in", reflectance_max=255),
@@ -444,6 +444,19 @@ def test_a_folder_is_not_converted_into_itself(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="source and output; expected another folder"):
         convert(open_scans(tmp_path), WRITERS["kitti"](tmp_path), progress=False)
     assert files(tmp_path) == before and not (tmp_path / SETTINGS).exists()
+
+
+def test_scans_of_others_in_the_folder_are_not_adopted(tmp_path: Path) -> None:
+    write_all("semantic_kitti", tmp_path / "in", [some_scan(0)])
+    write_all("kitti", tmp_path / "mine", [some_scan(1)])
+    before = files(tmp_path / "mine")
+    with pytest.raises(ConfigError, match=r"mine holds scans .*\.bin; expected a new"):
+        convert(
+            open_scans(tmp_path / "in"),
+            WRITERS["kitti"](tmp_path / "mine"),
+            progress=False,
+        )
+    assert files(tmp_path / "mine") == before
 
 
 def five_fields(folder: Path, *counts: int) -> Path:

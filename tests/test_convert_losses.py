@@ -120,3 +120,21 @@ def test_boxes_in_which_the_other_sensor_sees_nothing_are_left_out(
         and found.names == ("Car",)
         and np.allclose(found.values[0], near)
     )
+
+
+def test_boxes_outside_the_camera_are_counted_and_refused_on_request(
+    tmp_path: Path,
+) -> None:
+    scan = cast([car(12, 0), car(-12, 0)])
+    report = convert([scan], WRITERS["kitti_object"](tmp_path / "out"), progress=False)
+    lost = "boxes outside the camera's view"
+    assert report.lost[lost] == 1 and len(open_scans(tmp_path / "out")[0].boxes) == 1
+    ahead = replace(scan, boxes=scan.boxes[[0]], label=None, instance=None, ring=None)
+    assert lost not in WRITERS["kitti_object"](tmp_path).loses(ahead, None)
+    with pytest.raises(ConfigError, match=lost):
+        convert(
+            [scan],
+            WRITERS["kitti_object"](tmp_path / "strict"),
+            strict=True,
+            progress=False,
+        )

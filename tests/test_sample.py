@@ -13,7 +13,7 @@ from lidar_synth.datasets.recordings import NOTE
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.generate.loading import load_generator
-from lidar_synth.geometry.scan import SYNTHETIC
+from lidar_synth.geometry.scan import REAL, SYNTHETIC
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +83,16 @@ def test_sample_refuses_a_folder_that_holds_samples_of_another_seed(
     with pytest.raises(ConfigError, match=r"'seed': 4.*'seed': 5"):
         CliRunner().invoke(app, [*call, "--seed", "5"], catch_exceptions=False)
     assert (tmp_path / "out" / "000000.npz").read_bytes() == before
+
+
+def test_sample_does_not_adopt_recorded_scans(path: Path, tmp_path: Path) -> None:
+    from lidar_synth.cli import app
+
+    write_all("kitti", tmp_path, [random_scan(SENSOR, 400, 0)])
+    call = ["sample", str(tmp_path), "--model", str(path), "--to", "kitti"]
+    with pytest.raises(ConfigError, match="scans that this command did not write"):
+        CliRunner().invoke(app, call, catch_exceptions=False)
+    assert open_scans(tmp_path)[0].domain == REAL
 
 
 def test_sample_takes_another_format_after_one_that_cannot_hold_the_scans(

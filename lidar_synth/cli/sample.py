@@ -97,7 +97,6 @@ def sample(
 
     from lidar_synth.bake.conditions import conditions_for, fingerprint, settle_objects
     from lidar_synth.errors import choose
-    from lidar_synth.files.claims import hold_claim
     from lidar_synth.formats import WRITERS
     from lidar_synth.generate.flow.solvers import read_grid
     from lidar_synth.generate.loading import load_generator
@@ -132,7 +131,7 @@ def sample(
         "trained_on": provenance["data"],
         "seen": seen_by(provenance).to_list(),
     }
-    with hold_claim(writer.root / NOTE, settings):
+    with writer.hold(NOTE, settings):
         missing = [i for i in range(count) if not writer.complete(i)]
         for index, scan in _generate(generator, seed, missing, given, chosen, sampling):
             writer.write(scan, index)

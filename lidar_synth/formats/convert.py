@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.claims import hold_claim
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats import OnBad, ScanFiles, Writer
@@ -126,15 +125,12 @@ def convert(
         raise ConfigError(f"{jobs} jobs", "at least 1")
     change = _change(as_sensor)
     if isinstance(source, ScanFiles):
-        if source.root.resolve() == writer.root.resolve():
-            raise ConfigError(
-                f"{writer.root} as source and output", "another folder for the output"
-            )
         source.check_sensor()  # both first, so that a wrong sensor leaves no settings behind
         target = source.sensor if change is None else change.transfer.target
         writer.require_grid(target.by_beams() if unfold else target)
     models = models_of(source.root) if isinstance(source, ScanFiles) else []
-    with hold_claim(writer.root / SETTINGS, _settings(source, writer, change, unfold)):
+    settings = _settings(source, writer, change, unfold)
+    with writer.hold(SETTINGS, settings, source):
         work = partial(convert_one, source, writer, change, unfold, on_bad, strict)
         report = _write_missing(source, writer, change, work, on_bad, jobs, progress)
         write_models(writer.root, models if report.written or report.kept else [])
@@ -256,11 +252,11 @@ def convert_one(
             scan, seen = change.cast(scan, source, index)
             camera = change.calibration(camera)
         scan = reproject(scan, unfold=True) if unfold else scan
+        lost = writer.loses(scan, camera)
     except (DataError, FileError) as error:
         if on_bad != "skip":
             raise
         return Outcome(index, str(error))
-    lost = writer.loses(scan)
     if strict and lost:
         raise ConfigError(
             f"scan {scan.id!r} has {', '.join(lost)}, which {type(writer).__name__} cannot hold",

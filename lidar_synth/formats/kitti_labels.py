@@ -140,7 +140,7 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
         FileError: if it cannot be written.
         DataError: on a name of several words, or a value that readers refuse.
     """
-    image_box, truncation = _in_image(boxes, camera)
+    image_box, truncation = in_image(boxes, camera)
     floor, size, rotation_y = boxes_to_camera(boxes.values, camera)
     seen = floor - camera.camera_from_sensor[:3, 3]
     alpha = np.where(
@@ -170,10 +170,11 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     write_file(path, text.encode())
 
 
-def _in_image(
+def in_image(
     boxes: Boxes, camera: Calibration
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(M, 4) image boxes and (M,) truncations; unknown ones are computed from the corners."""
+    """(M, 4) image boxes and (M,) truncations; unknown ones are computed from the corners, and
+    stay below 0 outside of the view."""
     image_box = boxes.image_box.astype(np.float64)
     truncation = boxes.truncation.astype(np.float64)
     unknown = np.flatnonzero((boxes.image_box < 0).any(axis=1))

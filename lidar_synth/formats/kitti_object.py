@@ -31,7 +31,7 @@ from lidar_synth.files.disk import (
 from lidar_synth.files.parsing import picture_size
 from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
 from lidar_synth.formats.camera_boxes import IMAGE_SIZE, CameraBoxes, assumed_size
-from lidar_synth.formats.kitti_labels import read_label_2, write_label_2
+from lidar_synth.formats.kitti_labels import in_image, read_label_2, write_label_2
 from lidar_synth.formats.points import check_scale, read_points
 from lidar_synth.formats.source import OnBad
 from lidar_synth.formats.writer import Picture, Writer, write_image
@@ -265,6 +265,14 @@ class KITTIObjectWriter(Writer):
         if folder.name == "training" and scan.boxes is not None:
             write_label_2(folder / "label_2" / f"{frame}.txt", scan.boxes, camera)
         self._write_points(path, scan)
+
+    def loses(self, scan: Scan, camera: Calibration | None) -> list[str]:
+        lost = super().loses(scan, camera)
+        camera = camera or self.calibration or OBJECT_CAMERA
+        camera = replace(camera, image_size=assumed_size(camera))
+        if scan.boxes is not None and (in_image(scan.boxes, camera)[0] < 0).any():
+            lost.append("boxes outside the camera's view")
+        return lost
 
     def finish(self) -> None:
         for split, (part, *_) in SPLITS.items():

@@ -10,6 +10,7 @@ gathered by ``finish``, which one process calls at the end.
 import json
 import shutil
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files.claims import hold_claim
 from lidar_synth.files.disk import (
     join_inside,
     list_files,
@@ -143,6 +145,31 @@ class Writer(ABC):
             scan, self.path(index, name), picture, calibration or self.calibration
         )
 
+    def hold(
+        self, note: str, settings: dict[str, Any], source: object = None
+    ) -> AbstractContextManager[None]:
+        """Claim the folder by its file ``note``, as ``hold_claim`` does.
+
+        Raises:
+            ConfigError: also if the source's folder is this one, or one that is claimed for the
+                first time holds files like those of scans.
+        """
+        if (
+            isinstance(source, ScanFiles)
+            and source.root.resolve() == self.root.resolve()
+        ):
+            raise ConfigError(
+                f"{self.root} as source and output", "another folder for the output"
+            )
+        path = self.root / note
+        there = self.root.rglob(f"*{self.path(0).suffix}")
+        if not path.is_file() and (scan := next(there, None)):
+            raise ConfigError(
+                f"{self.root} holds scans that this command did not write, such as {scan}",
+                "a new or an empty folder",
+            )
+        return hold_claim(path, settings)
+
     def require_grid(self, sensor: Sensor) -> None:
         """Refuse a sensor if the folder is described (``scans.json``) as holding scans on another
         grid.
@@ -164,8 +191,13 @@ class Writer(ABC):
             self._description = record(self.root, scan.sensor, origin)
         write_points(path, scan)
 
-    def loses(self, scan: Scan) -> list[str]:
-        """What the scan has, but the layout cannot hold; names of ``DETAILS``."""
+    def loses(self, scan: Scan, camera: Calibration | None) -> list[str]:
+        """What the scan has, but the layout cannot hold: names of ``DETAILS``, or words.
+
+        Args:
+            scan: the scan.
+            camera: as ``calibration`` of ``write``.
+        """
         return [
             name
             for name in DETAILS
