@@ -1,6 +1,7 @@
 """``lidar-synth convert``: converts scans from any supported format to any other."""
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -127,10 +128,12 @@ def convert(
         "strict": strict,
     }
     report = run(scans, writer, as_sensor=change, **how)
-    _print(report, out, to, as_sensor)
+    print_report(report, out, to, as_sensor)
 
 
-def _print(report: "Report", out: Path, to: str, as_sensor: str | None) -> None:
+def print_report(
+    report: "Report", out: Path, to: str, as_sensor: str | None = None
+) -> None:
     """What was written, and on standard error what was not."""
     print(
         f"{out}: {report.written} scans written, {report.kept} were there already, "
@@ -193,12 +196,23 @@ def _change(
 
 def read_mount(text: str | None) -> tuple[float, float]:
     """Metres and degrees of the text Z,PITCH."""
+    expected = "metres and degrees, for instance 0.1,0"
+    z, pitch = read_numbers(f"--mount {text}", text or "0,0", (2,), expected)
+    return z, pitch
+
+
+def read_numbers(
+    given: str, text: str, counts: tuple[int, ...], expected: str
+) -> list[float]:
+    """The numbers of a text, with commas between them.
+
+    Raises:
+        ConfigError: on another text, or another count of numbers.
+    """
     from lidar_synth.errors import ConfigError
 
-    try:
-        z, pitch = map(float, (text or "0,0").split(","))
-    except ValueError:
-        raise ConfigError(
-            f"--mount {text}", "metres and degrees, for instance 0.1,0"
-        ) from None
-    return z, pitch
+    with suppress(ValueError):
+        values = list(map(float, text.split(",")))
+        if len(values) in counts:
+            return values
+    raise ConfigError(given, expected)

@@ -1,12 +1,12 @@
 """``lidar-synth edit``: removes objects from scans, sets them into scans and moves them."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidar_synth.cli.convert import print_report, read_numbers
 from lidar_synth.cli.options import Format, Out, Source
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ Place = Annotated[
 
 @edit.command("remove")
 def remove_objects(
+    context: typer.Context,
     source: Source,
     out: Out,
     box: Annotated[
@@ -61,35 +62,25 @@ def remove_objects(
       lidar-synth edit remove town out --scan 0 --box 3 --model town
     """
     from lidar_synth.errors import ConfigError
-    from lidar_synth.formats import open_scans
     from lidar_synth.labels.edit import remove
 
     if bool(box) == bool(name):
         raise ConfigError(f"--box {box}, --name {name}", "one of the two")
-    scans = open_scans(source)
     count = 0
-    chosen = range(len(scans)) if scan is None else [_number(scan, len(scans))]
-    with _writing(out, to) as writer:
-        writer.carry(scans)
-        for index in chosen:
-            given = scans[index]
-            numbers = list(box or ()) if not name else _named(given, name)
-            edited = given
-            if numbers:
-                edited = remove(given, numbers, model=model, seed=seed)
-            count += len(numbers)
-            calibration = scans.calibration(index)
-            writer.write(edited, index, name=given.id, calibration=calibration)
-    if name and not count:
-        raise ConfigError(
-            f"--name {', '.join(name)}",
-            "the class of some box in these scans, such as KITTI's or the town's",
-        )
+
+    def change(given: "Scan") -> "Scan":
+        nonlocal count
+        numbers = box or _named(given, name or [])
+        count += len(numbers)
+        return remove(given, numbers, model=model, seed=seed)
+
+    _edit(context, source, out, scan, to, change, name)
     print(f"{out}: {count} objects removed")
 
 
 @edit.command("insert")
 def insert_object(
+    context: typer.Context,
     source: Source,
     out: Out,
     objects: Annotated[
@@ -115,13 +106,20 @@ def insert_object(
     bank = ObjectBank.load(objects)
     if number >= len(bank):
         raise ConfigError(f"--number {number} of {bank}", f"0 to {len(bank) - 1}")
-    _edit_one(
-        source, out, scan, to, lambda given: insert(given, bank[number], _pose(at))
+    edited = _edit(
+        context,
+        source,
+        out,
+        scan,
+        to,
+        lambda given: insert(given, bank[number], _pose(at)),
     )
+    _print_last(out, edited)
 
 
 @edit.command("move")
 def move_object(
+    context: typer.Context,
     source: Source,
     out: Out,
     box: Annotated[int, typer.Option(min=0, help="number of the box")],
@@ -139,25 +137,19 @@ def move_object(
     """
     from lidar_synth.labels.edit import move
 
-    _edit_one(
+    edited = _edit(
+        context,
         source,
         out,
         scan,
         to,
         lambda given: move(given, box, _pose(at), model=model, seed=seed),
     )
+    _print_last(out, edited)
 
 
-def _edit_one(source: str, out: Path, number: int, to: str, change: Any) -> None:
-    from lidar_synth.formats import open_scans
-
-    scans = open_scans(source)
-    given = scans[_number(number, len(scans))]
-    edited = change(given)
-    calibration = scans.calibration(number)
-    with _writing(out, to) as writer:
-        writer.carry(scans)
-        writer.write(edited, number, name=given.id, calibration=calibration)
+def _print_last(out: Path, edited: Any) -> None:
+    """Where the last box of a scan is, which was set there."""
     box = edited.boxes.values[-1]
     inside = int(edited.boxes.contain(edited.points)[-1].sum())
     print(
@@ -166,26 +158,49 @@ def _edit_one(source: str, out: Path, number: int, to: str, change: Any) -> None
     )
 
 
-@contextmanager
-def _writing(out: Path, to: str) -> Iterator[Any]:
-    """The writer of a folder that no other process writes meanwhile, which is finished at the
-    end; several edits may share a folder."""
-    from lidar_synth.errors import choose
-    from lidar_synth.files.claims import hold_claim
-    from lidar_synth.formats import WRITERS
+def _edit(
+    context: typer.Context,
+    source: str,
+    out: Path,
+    number: int | None,
+    to: str,
+    change: Callable[["Scan"], Any],
+    names: list[str] | None = None,
+) -> Any:
+    """Write one scan of a source, or all, as they are after a change; the last one.
+
+    Several edits may share a folder, each of other scans: beside a scan stands the call that wrote
+    it, which may be run again.
+    """
+    from lidar_synth.errors import ConfigError, choose
+    from lidar_synth.files.claims import claim
+    from lidar_synth.formats import WRITERS, open_scans
+    from lidar_synth.formats.convert import Report
 
     writer = choose("--to", to, WRITERS)(out)
-    with hold_claim(writer.root / ".edit.json", {"format": to}):
-        yield writer
+    scans = open_scans(source)
+    chosen = range(len(scans))
+    if number is not None:
+        if number not in chosen:
+            raise ConfigError(f"--scan {number} of {len(scans)}", f"0 to {chosen[-1]}")
+        chosen = range(number, number + 1)
+    if names and not any(_named(scans[index], names) for index in chosen):
+        raise ConfigError(
+            f"--name {', '.join(names)}",
+            "the class of some box in these scans, such as KITTI's or the town's",
+        )
+    call = f"{context.info_name} {context.params | {'out': None}}"
+    with writer.hold(".edit.json", {"format": to}, scans):
+        report = Report(len(chosen), left_out=writer.carry(scans))
+        for index in chosen:
+            edited = change(scans[index])
+            claim(writer.root / f".edit-{index}.json", {"edit": call})
+            camera = scans.calibration(index)
+            writer.write(edited, index, name=scans.ids[index], calibration=camera)
+            report.lost.update(writer.loses(edited, camera))
         writer.finish()
-
-
-def _number(scan: int, count: int) -> int:
-    from lidar_synth.errors import ConfigError
-
-    if scan >= count:
-        raise ConfigError(f"--scan {scan} of {count}", f"0 to {count - 1}")
-    return scan
+    print_report(report, out, to)
+    return edited
 
 
 def _named(scan: "Scan", names: list[str]) -> list[int]:
@@ -200,15 +215,6 @@ def _pose(text: str) -> list[float]:
     """x, y and, if given, yaw in radians."""
     from math import radians
 
-    from lidar_synth.errors import ConfigError
-
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in (2, 3):
-        raise ConfigError(
-            f"--at {text}",
-            "X,Y in metres, or X,Y,YAW with degrees, for instance 14,-3 or 14,-3,90",
-        )
+    expected = "X,Y in metres, or X,Y,YAW with degrees, for instance 14,-3 or 14,-3,90"
+    values = read_numbers(f"--at {text}", text, (2, 3), expected)
     return [*values[:2], *map(radians, values[2:])]

@@ -1,0 +1,81 @@
+"""``lidar-synth edit``: what it refuses before it writes, and what it says about losses."""
+
+from pathlib import Path
+
+import pytest
+from box_scenes import car, cast, wall
+from layouts import write_all
+from typer.testing import CliRunner
+
+from lidar_synth.cli import app
+from lidar_synth.errors import ConfigError, DataError
+
+SCAN = cast([car(12, 0, 0.3), car(-8, 8)], [wall(24, 0, 1.57, length=80)])
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    write_all("npz", tmp_path / "in", [SCAN] * 2)
+    return tmp_path / "in"
+
+
+def call(*words: object) -> str:
+    return (
+        CliRunner()
+        .invoke(app, ["edit", *map(str, words)], catch_exceptions=False)
+        .output
+    )
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    paths = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path): path.read_bytes() for path in paths}
+
+
+def test_a_source_is_not_edited_in_place(source: Path) -> None:
+    before = files(source)
+    with pytest.raises(ConfigError, match="source and output; expected another folder"):
+        call("remove", source, source, "--box", 0)
+    assert files(source) == before
+
+
+def test_recorded_scans_in_the_folder_stay_as_they_are(
+    source: Path, tmp_path: Path
+) -> None:
+    write_all("npz", tmp_path / "mine", [SCAN])
+    before = files(tmp_path / "mine")
+    with pytest.raises(ConfigError, match="mine holds scans that this command did not"):
+        call("remove", source, tmp_path / "mine", "--box", 0)
+    assert files(tmp_path / "mine") == before
+
+
+def test_a_scan_is_edited_once_in_a_folder_and_by_the_same_call(
+    source: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    first = ("remove", source, out, "--box", 0, "--scan", 0)
+    call(*first)
+    before = files(out)
+    call(*first)
+    assert files(out) == before
+    with pytest.raises(ConfigError, match=r"was filled with .*choose another folder"):
+        call("remove", source, out, "--box", 1, "--scan", 0)
+    assert files(out) == before
+    call("move", source, out, "--box", 0, "--at", "14,-6", "--scan", 1)
+    assert files(out).items() > before.items()
+
+
+def test_a_class_without_a_box_writes_nothing(source: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="expected the class of some box"):
+        call("remove", source, tmp_path / "out", "--name", "Dragon")
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(DataError, match=r"box \[500\]"):
+        call("remove", source, tmp_path / "out", "--box", 500)
+    assert not files(tmp_path / "out")
+
+
+def test_what_the_format_cannot_hold_is_named(source: Path, tmp_path: Path) -> None:
+    told = call("remove", source, tmp_path / "out", "--box", 0, "--to", "kitti")
+    assert "dropped boxes of 2 scans, which kitti cannot hold" in told
+    objects = call("remove", source, tmp_path / "o", "--box", 0, "--to", "kitti_object")
+    assert "dropped boxes outside the camera's view of 2 scans" in objects
