@@ -16,6 +16,7 @@ import numpy as np
 from lidar_synth.integrations.launcher import prepare_script, run
 from lidar_synth.integrations.mixture import (
     EpochLoader,
+    MixedEpoch,
     class_ids,
     id_table,
     mix_for_trainer,
@@ -53,7 +54,7 @@ def register() -> Any:
             "cd Cylinder3D",
         ) from error
 
-    class MixedPointCloud(SemKITTI_sk):  # type: ignore[misc]
+    class MixedPointCloud(MixedEpoch, SemKITTI_sk):  # type: ignore[misc]
         """``SemKITTI_sk`` with synthetic scans in its training set: (xyz, label (N, 1) uint8,
         strength)."""
 
@@ -61,21 +62,11 @@ def register() -> Any:
             self, data_path: str, imageset: str = "train", **options: Any
         ) -> None:
             super().__init__(data_path, imageset, **options)
-            self.mixed = None
             if imageset == "train":
                 settings = read_settings()
                 refuse_unlabelled(settings, "Cylinder3D")
                 self._ids = trainer_ids(self.learning_map, take_classes(settings), _IDS)
                 self.mixed = mix_for_trainer(len(self.im_idx), settings)
-
-        def set_epoch(self, epoch: int) -> None:
-            """Set the epoch, also for workers."""
-            if self.mixed is not None:
-                self.mixed.set_epoch(epoch)
-                self.mixed.plan()  # logs it
-
-        def __len__(self) -> int:
-            return super().__len__() if self.mixed is None else len(self.mixed)
 
         def __getitem__(self, index: int) -> Any:
             sample = index if self.mixed is None else self.mixed[index]

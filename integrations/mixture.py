@@ -122,6 +122,20 @@ def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:
         )
 
 
+def require_labels(scan: Scan) -> None:
+    """Check that a synthetic scan has a valid label.
+
+    Raises:
+        DataError: on a scan without any, because the loss of a batch of such scans would be NaN.
+    """
+    if scan.label is None or not (scan.label != IGNORE).any():
+        raise DataError(
+            f"synthetic scan {scan.id!r} has no valid label",
+            "at least one, or the loss of a batch can be NaN",
+            "Use a model or bank with labels.",
+        )
+
+
 def class_ids(scan: Scan, table: NDArray[Any]) -> NDArray[Any]:
     """Convert a scan's labels to a trainer's class ids, (N,).
 
@@ -130,15 +144,9 @@ def class_ids(scan: Scan, table: NDArray[Any]) -> NDArray[Any]:
         table: (256,) the trainer's id by train id, see ``id_table``.
 
     Raises:
-        DataError: on a scan without any valid label, because the loss of a batch of such scans
-            would be NaN.
+        DataError: as ``require_labels``.
     """
-    if scan.label is None or not (scan.label != IGNORE).any():
-        raise DataError(
-            f"synthetic scan {scan.id!r} has no valid label",
-            "at least one, or the loss of a batch can be NaN",
-            "Use a model or bank with labels.",
-        )
+    require_labels(scan)
     ids: NDArray[Any] = table[scan.label]
     return ids
 
@@ -195,6 +203,27 @@ def inner(
         for each in wrapped if isinstance(wrapped, list | tuple) else [wrapped]:
             if each is not None:
                 yield from inner(each, names)
+
+
+class MixedEpoch:
+    """What a trainer's dataset that is mixed has; combine it with that dataset.
+
+    Attributes:
+        mixed: the mixture; None where the dataset has real scans only.
+    """
+
+    mixed: Any = None
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch, also for workers."""
+        if self.mixed is not None:
+            self.mixed.set_epoch(epoch)
+            self.mixed.plan()  # logs it
+
+    def __len__(self) -> int:
+        if self.mixed is None:
+            return int(super().__len__())  # type: ignore[misc]
+        return len(self.mixed)
 
 
 class EpochLoader(DataLoader[Any]):

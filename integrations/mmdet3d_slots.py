@@ -16,11 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from lidar_synth.integrations.mixture import (
-    class_ids,
-    id_table,
     mix_for_trainer,
-    open_synthetic,
     points_of,
+    require_labels,
 )
 from lidar_synth.integrations.mmdet3d_lists import CLASSES
 from lidar_synth.integrations.nuscenes import CLASSES as NUSCENES_CLASSES
@@ -34,7 +32,6 @@ from lidar_synth.files.disk import read_text
 from lidar_synth.formats.calibration import Calibration, in_view
 from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.mixing import Synthetic, make_synthetic
 from lidar_synth.mixing.schedules import settled
 
 PREFIX = "lsynth://"
@@ -231,34 +228,24 @@ def draw_in_epoch(path: Path, results: dict[str, Any]) -> dict[str, Any]:
     return results
 
 
-@cache
-def _opened(source: str) -> Synthetic:
-    return make_synthetic(open_synthetic(source))
-
-
 def read_url(url: str) -> bytes:
     """The bytes of ``lsynth://<source>/<number>.bin`` (float32 points) or ``.label``
     (SemanticKITTI's).
 
     Args:
-        url: the URL; its source is the folder of a mixed list, whose layout the points have, or
-            else a bank, a checkpoint or a folder of scans, with points x, y, z, reflectance.
+        url: the URL; its source is the folder of a mixed list, whose layout the points have.
 
     Raises:
         DataError: on any other URL, or on labels of a scan without labels.
+        FileError: if there is no such list.
     """
     source, number, kind = split_url(url)
     scan = scan_of(source, number)
     if kind == "bin":
-        points = (
-            open_folder(Path(source)).layout.points if is_mixed(source) else points_of
-        )
-        return points(scan).astype("<f4").tobytes()
-    class_ids(scan, _TRAIN_IDS)
+        points = open_folder(Path(source)).layout.points(scan)
+        return points.astype("<f4").tobytes()
+    require_labels(scan)
     return encode_labels(scan, SEMANTIC_KITTI).astype("<u4").tobytes()
-
-
-_TRAIN_IDS = id_table(0, 255, np.uint8)
 
 
 def split_url(url: str) -> tuple[str, int, str]:
@@ -275,20 +262,18 @@ def split_url(url: str) -> tuple[str, int, str]:
         and number.isdigit()
         and kind in ("bin", "label")
     ):
-        raise DataError(f"{url!r}", f"{PREFIX}<folder or bank>/<number>.bin or .label")
+        raise DataError(f"{url!r}", f"{PREFIX}<folder>/<number>.bin or .label")
     return source, int(number), kind
 
 
-def is_mixed(source: str | Path) -> bool:
-    """Whether a URL's source is the folder of a mixed list."""
-    return (Path(source) / MIXTURE).is_file()
+def is_mixed(folder: Path) -> bool:
+    """Whether a folder is that of a mixed list."""
+    return (folder / MIXTURE).is_file()
 
 
 def scan_of(source: str, number: int) -> Scan:
     """The scan that a URL names."""
-    if is_mixed(source):
-        return open_folder(Path(source)).scan(number)
-    return _opened(source)[number]
+    return open_folder(Path(source)).scan(number)
 
 
 def require_boxes(scan: Scan) -> Boxes:

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from lidar_synth.integrations.mixture import (
     EpochLoader,
+    MixedEpoch,
     class_ids,
     id_table,
     mix_for_trainer,
@@ -90,7 +91,7 @@ def dataset_class() -> Any:
 def _split_class(stock: Any) -> Any:
     """Make the class of the training split from the module with Open3D-ML's own."""
 
-    class MixedSplit(stock.SemanticKITTISplit):  # type: ignore[misc]
+    class MixedSplit(MixedEpoch, stock.SemanticKITTISplit):  # type: ignore[misc]
         """The training split: unchanged real scans, mixed with synthetic ones."""
 
         def __init__(self, dataset: Any, split: str = "training") -> None:
@@ -98,14 +99,6 @@ def _split_class(stock: Any) -> Any:
             real = len(dataset.get_split_list(split))
             self.mixed = mix_for_trainer(real, dataset.mixture)
             super().__init__(dataset, split=split)
-
-        def set_epoch(self, epoch: int) -> None:
-            """Set the epoch, also for workers."""
-            self.mixed.set_epoch(epoch)
-            self.mixed.plan()  # logs it
-
-        def __len__(self) -> int:
-            return len(self.mixed)
 
         def get_data(self, idx: int) -> dict[str, Any]:
             """Points (N, 3), features (N, 1) float32 and labels (N,) int32, 0 = unlabelled."""

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from lidar_synth.integrations.launcher import plain_errors, prepare_script, run
 from lidar_synth.integrations.mixture import (
-    class_ids,
-    id_table,
+    MixedEpoch,
     mix_for_trainer,
     points_of,
     read_settings,
     refuse_unlabelled,
+    require_labels,
     take_classes,
 )
 from numpy.typing import NDArray
@@ -52,7 +52,6 @@ STRIPES = 0.25
 """Largest difference of ``gaps`` between real and synthetic images; below, the eye sees images of
 one density."""
 
-_TRAIN_IDS = id_table(0, 255, np.uint8)
 _MEMORY = next((str(folder) for folder in (Path("/dev/shm"),) if folder.is_dir()), None)
 
 
@@ -75,7 +74,7 @@ def dataset_class(stock: Any) -> Any:
         stock: the module of the trainer's parser.
     """
 
-    class MixedRangeImages(stock.SemanticKitti):  # type: ignore[misc]
+    class MixedRangeImages(MixedEpoch, stock.SemanticKitti):  # type: ignore[misc]
         """The trainer's dataset, mixed with synthetic scans."""
 
         scan_files: Any
@@ -95,14 +94,6 @@ def dataset_class(stock: Any) -> Any:
             _check_classes(self.learning_map, self.learning_map_inv, self.taxonomy)
             self.mixed = mix_for_trainer(len(self.scan_files), settings)
             check_stripes(self)
-
-        def set_epoch(self, epoch: int) -> None:
-            """Set the epoch, also for workers."""
-            self.mixed.set_epoch(epoch)
-            self.mixed.plan()  # logs it
-
-        def __len__(self) -> int:
-            return len(self.mixed)
 
         def __getitem__(self, index: int) -> Any:
             sample = self.mixed[index]
@@ -351,7 +342,7 @@ def _write(folder: Path, scan: Scan, taxonomy: Taxonomy) -> tuple[str, str]:
     """Write the scan as the two files of sequence ``synthetic``; the trainer reads names from the
     path."""
     name = "".join(letter if letter.isalnum() else "_" for letter in scan.id)
-    class_ids(scan, _TRAIN_IDS)  # refuses a scan without a valid label
+    require_labels(scan)
     paths = [
         folder / "synthetic" / kind / f"{name}.{ext}"
         for kind, ext in (("velodyne", "bin"), ("labels", "label"))

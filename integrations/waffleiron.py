@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from lidar_synth.integrations.launcher import CPU, plain_errors, prepare_script
 from lidar_synth.integrations.mixture import (
+    MixedEpoch,
     class_ids,
     id_table,
     mix_for_trainer,
@@ -45,12 +46,9 @@ def dataset_class(stock: Any) -> Any:
     """Make a subclass of WaffleIron's ``SemanticKITTI`` (``stock``) that mixes real and synthetic
     scans."""
 
-    class MixedWaffleIron(stock):  # type: ignore[misc]
-        """WaffleIron's ``SemanticKITTI`` with synthetic scans in its training set."""
-
-        mixed: Any = (
-            None  # while the stock class extracts instances, it has only real scans
-        )
+    class MixedWaffleIron(MixedEpoch, stock):  # type: ignore[misc]
+        """WaffleIron's ``SemanticKITTI`` with synthetic scans in its training set; while the stock
+        class extracts instances, it has only real scans."""
 
         def __init__(self, **options: Any) -> None:
             super().__init__(**options)
@@ -64,12 +62,8 @@ def dataset_class(stock: Any) -> Any:
 
         def set_epoch(self, epoch: int) -> None:
             """Set the epoch, also for workers."""
-            self.mixed.set_epoch(epoch)
-            self.mixed.plan()  # logs it
+            super().set_epoch(epoch)
             self.im_idx = range(len(self.mixed))  # the stock class looks up a name here
-
-        def __len__(self) -> int:
-            return super().__len__() if self.mixed is None else len(self.mixed)
 
         def __load_pc_internal__(self, index: int) -> Any:
             """Points (N, 4) float32, labels (N,) int32 0..18 or 255, and instances (N,) uint32, 0 =

@@ -30,12 +30,13 @@ from lidar_synth.integrations.mixture import (
     refuse_unlabelled,
     require_ids,
 )
+from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import (
     kitti_list,
     read_plane,
     semantic_kitti_list,
 )
-from lidar_synth.integrations.mmdet3d_slots import read_url
+from lidar_synth.integrations.mmdet3d_slots import open_folder, read_url
 from mixtures import SENSOR as SMALL
 from mixtures import Endless, Scans, as_is
 from streets import CAMERA, kitti, semantic_kitti, street, synthetic
@@ -408,16 +409,18 @@ def test_a_list_for_mmdetection3d_has_the_regions_without_boxes(tmp_path: Path) 
     assert excused.keys() == found[0].keys()  # the trainer takes those of the first
 
 
-def test_urls_of_a_folder_of_scans(tmp_path: Path) -> None:
-    folder = synthetic(tmp_path / "scans", 2)
-    scan = open_scans(folder)[1]
-    points = np.frombuffer(read_url(f"lsynth://{folder}/000001.bin"), "<f4").reshape(
-        -1, 4
-    )
-    assert np.array_equal(points, points_of(scan))
-    bare = synthetic(tmp_path / "bare", 1, labels=False)
+def test_urls_of_a_mixed_list(tmp_path: Path) -> None:
+    real = kitti_list(kitti(tmp_path / "real", 2), tmp_path / "train.json")
+    made = synthetic(tmp_path / "made", 2, labels=False)
+    settings = {"synthetic": made, "ratio": 0.5, "labels": "boxes"}
+    where = {"data_root": tmp_path / "real", "points": "training/velodyne_reduced"}
+    folder = write_infos(tmp_path / "mixed", real, settings, **where).parent
+    points = np.frombuffer(read_url(f"lsynth://{folder}/1.bin"), "<f4").reshape(-1, 4)
+    assert np.array_equal(points, points_of(open_folder(folder).scan(1)))
     with pytest.raises(DataError, match="no valid label"):
-        read_url(f"lsynth://{bare}/000000.label")
+        read_url(f"lsynth://{folder}/1.label")
+    with pytest.raises(FileError, match="mixture.json"):
+        read_url(f"lsynth://{made}/1.bin")
 
 
 @pytest.mark.parametrize(

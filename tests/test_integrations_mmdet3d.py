@@ -396,15 +396,16 @@ def test_scans_without_a_box_are_not_replaced(made: Path, tmp_path: Path) -> Non
         detection(made, ann_file=str(path), filter_empty_gt=True)
 
 
-def test_a_bank_is_read_by_url(made: Path) -> None:
-    source = open_scans(made / "synthetic")
-    url = f"lsynth://{made / 'synthetic'}/3"
+def test_a_slot_is_read_by_url(made: Path) -> None:
+    folder = open_folder(made / "seg")
+    folder.epoch = 0
+    url = f"lsynth://{made / 'seg'}/3"
     points = np.frombuffer(get(f"{url}.bin"), "<f4").reshape(-1, 4)
-    assert np.array_equal(points[:, :3], source[3].points)
+    assert np.array_equal(points[:, :3], folder.scan(3).points)
     labels = np.frombuffer(get(f"{url}.label"), "<u4") & 0xFFFF
     assert set(labels.tolist()) == {10, 40, 50}
     for wrong in (f"{url}.png", "lsynth://3.bin", f"{url}x.bin"):
-        with pytest.raises(DataError, match="lsynth://<folder or bank>"):
+        with pytest.raises(DataError, match="lsynth://<folder>"):
             read_url(wrong)
 
 
@@ -556,7 +557,11 @@ def test_a_recipe_trains_40_epochs_and_validates(task: str, tmp_path: Path) -> N
     config = Config.fromfile(str(tmp_path / "mixed.py"))
     if task == "detection":  # the scans of the test have cars only
         sampler = config.train_dataloader.dataset.dataset.pipeline[2].db_sampler
-        sampler.update(classes=["Car"], sample_groups={"Car": 5}, prepare={})
+        sampler.classes, sampler.sample_groups, sampler.prepare = (
+            ["Car"],
+            {"Car": 5},
+            {},
+        )
     train = DATASETS.build(config.train_dataloader.dataset)
     assert len(adapter.SynthSampler(train)) > 0 and train[0] is not None
     for loader in (config.val_dataloader, config.test_dataloader):
