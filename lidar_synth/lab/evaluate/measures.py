@@ -126,7 +126,7 @@ def _class_mmd(
 ) -> Statistic:
     size = CLASSES * bins**2
     rows = [normalised_sparse_rows(side, size) for side in (real, fake)]
-    return gaussian_mmd(*rows, (len(real), len(fake)), size)
+    return gaussian_mmd(rows[0], rows[1], (len(real), len(fake)), size)
 
 
 KINDS = {
