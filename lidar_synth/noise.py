@@ -15,6 +15,7 @@ has its own stream.
 
 import math
 from collections.abc import Sequence
+from typing import SupportsIndex
 
 import numpy as np
 import torch
@@ -194,10 +195,11 @@ def _words(
 
 
 def _check(seed: int, indices: Sequence[int], shape: Sequence[int]) -> None:
-    if not 0 <= seed < 2**64:
-        raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
-    if wrong := [i for i in indices if not 0 <= i < 2**63]:
-        raise ConfigError(f"index {wrong[0]}", "0 <= index < 2^63")
+    if not isinstance(seed, SupportsIndex) or not 0 <= seed < 2**64:
+        raise ConfigError(f"seed {seed}", "0 <= seed < 2^64, an integer")
+    for i in indices:
+        if not isinstance(i, SupportsIndex) or not 0 <= i < 2**63:
+            raise ConfigError(f"index {i}", "0 <= index < 2^63, an integer")
     if min(shape, default=1) < 1 or math.prod(shape) >= 2**34:
         raise ConfigError(
             f"noise of shape {tuple(shape)}",

@@ -107,6 +107,12 @@ def test_an_unknown_sampling_option_is_refused(generator: Generator) -> None:
             call(0, [0], step=2)
 
 
+def test_arguments_that_are_no_numbers_of_scans_are_refused(path: Path) -> None:
+    for batch in (0, -1, 2.5):
+        with pytest.raises(ConfigError, match=f"batch={batch}; expected a number of"):
+            load_generator(path, batch=batch)  # type: ignore[arg-type]
+
+
 def test_steps_and_solver_replace_the_checkpoints_own_grid(
     generator: Generator,
 ) -> None:

@@ -168,6 +168,8 @@ def test_dtypes_are_rounded_from_float64() -> None:
         (2**64, [0], (1,), "seed 18446744073709551616"),
         (0, [3, -2], (1,), r"index -2; expected 0 <= index < 2\^63"),
         (0, [2**63], (1,), "index 9223372036854775808"),
+        (0, [1, 0.5], (1,), r"index 0.5; .* an integer"),
+        (0.5, [1], (1,), r"seed 0.5; .* an integer"),
         (0, [0], (2, 0), r"noise of shape \(2, 0\); expected positive sizes"),
     ],
 )

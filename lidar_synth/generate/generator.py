@@ -101,6 +101,8 @@ class Generator:
         own = self.header.sensor.columns
         widths = getattr(self.autoencoder, "widths", (own,))
         if self.columns is not None and self.columns not in widths:
+        if not isinstance(self.batch, int) or self.batch < 1:
+            raise ConfigError(f"batch={self.batch}", "a number of scans, at least 1")
             raise ConfigError(
                 f"{self.columns} columns of {self.name!r}",
                 f"one of {', '.join(map(str, widths))}",

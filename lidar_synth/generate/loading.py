@@ -41,8 +41,8 @@ def load_generator(
         columns: of the scans; a model of 2,048 generates 1,024 at about half of the decoder's cost.
 
     Raises:
-        ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, or a
-            number of columns that the model cannot generate.
+        ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, a
+            batch below 1, or a number of columns that the model cannot generate.
         FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
         LibraryError: on a model on the hub without the extra ``hub``.
 
@@ -69,7 +69,7 @@ def load_generator(
         _compile(checkpoint.networks)
     flow = join(checkpoint.networks)
     autoencoder = checkpoint.networks.get(CODEC)
-    size = batch or BATCH.get(device.type, 1)
+    size = BATCH.get(device.type, 1) if batch is None else batch
     return Generator(
         path.stem,
         flow,
