@@ -194,6 +194,7 @@ def test_arrays_tensors_and_dictionaries_are_accepted_as_conditions(
         conditioned.scans(0, [0], np.zeros((8, 16), np.uint8))
     with pytest.raises(DataError, match="no condition for 'conditioned'"):
         conditioned.scans(0, [0])
+    assert conditioned.scans(0, [], condition=[]) == []
     with pytest.raises(ConfigError, match="the model is unconditional"):
         generator.scans(0, [0], many[0])
     assert (generator.condition, conditioned.condition) == (None, "semantic")

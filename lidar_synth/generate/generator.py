@@ -243,6 +243,8 @@ class Generator:
         given = self._condition(condition, len(indices))
         laid = self.condition == "layout"
         boxes = boxed.boxes_of(condition, len(indices)) if laid else None
+        if not len(indices):
+            return []
         cast = boxes is not None and isinstance(objects, boxed.Drawer)
         if objects is not None and not cast:
             raise ConfigError(
