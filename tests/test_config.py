@@ -274,7 +274,13 @@ def test_a_run_that_ends_before_its_recipe_begins_is_warned_of(
 
 
 @pytest.mark.parametrize(
-    "grid", ["[1, 0.5, 0]", "[1, 0.5, 0.6, 0.2, 0]", "[0.9, 0.6, 0.5, 0.2, 0]"]
+    "grid",
+    [
+        "[1, .nan, 0.5, 0.2, 0]",
+        "[1, 0.5, 0]",
+        "[1, 0.5, 0.6, 0.2, 0]",
+        "[0.9, 0.6, 0.5, 0.2, 0]",
+    ],
 )
 def test_a_grid_that_is_none_is_refused(grid: str) -> None:
     with pytest.raises(ConfigError, match="descending times from 1 to 0"):

@@ -31,7 +31,6 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,7 +43,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import open_file, write_file
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned
 from lidar_synth.generate.devices import check_device
-from lidar_synth.generate.flow.solvers import uniform_grid
+from lidar_synth.generate.flow.solvers import read_grid, uniform_grid
 from lidar_synth.generate.models import assemble
 from lidar_synth.geometry.normalize import LABEL_BITS, Normalisation, TensorFormat
 from lidar_synth.geometry.sensor import Sensor
@@ -92,15 +91,7 @@ class Header:
                 f"{VELOCITY!r} or {CODEC!r} among them",
             )
         for grid in (self.time_grid, *self.other_grids):
-            if (
-                len(grid) < 2
-                or (grid[0], grid[-1]) != (1, 0)
-                or any(a <= b for a, b in pairwise(grid))
-            ):
-                raise ConfigError(
-                    f"time grid {grid}",
-                    "at least two times descending from 1 (noise) to 0 (data)",
-                )
+            read_grid(grid)
         if missing := [
             k for k in ("data", "data_licence", "licence") if not self.provenance.get(k)
         ]:

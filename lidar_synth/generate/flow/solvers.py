@@ -90,7 +90,8 @@ def read_grid(times: Sequence[float | str]) -> tuple[float, ...]:
         grid = tuple(map(float, times))
     except ValueError:
         grid = ()
-    if sorted(set(grid), reverse=True) != list(grid) or grid[:1] + grid[-1:] != (1, 0):
+    falls = all(a > b for a, b in pairwise(grid))
+    if not falls or grid[:1] + grid[-1:] != (1, 0):
         raise ConfigError(
             f"a time grid of {', '.join(map(str, times))}",
             "descending times from 1 to 0, such as 1, 0.86, 0.58, 0.22, 0",
