@@ -317,7 +317,6 @@ class Generator:
         refuse_worker(self.device)
         given = self._condition(condition, len(indices))
         codec = self.codec
-        noise_shape = (codec.draws, *self.sensor.shape)
         grid = self.header.grid(steps) if times is None else read_grid(times)
         if times is not None and steps is not None:
             raise ConfigError(f"steps {steps} and times {grid}", "one of the two")
@@ -328,25 +327,32 @@ class Generator:
             )
         for first in range(0, len(indices), self.batch):
             part = slice(first, first + self.batch)
-            noise = gaussian(seed, indices[part], codec.shape, self.device)
-            uniform_noise = (
-                uniform(seed, indices[part], noise_shape, self.device)
-                if codec.draws
-                else None
-            )
+            noise, draws = self.draw_noise(seed, indices[part], self.sensor)
             with torch.inference_mode():
                 own = None if given is None else given[part]
                 velocity, cond = self._flow(own, guidance, grid)
                 state = solve(velocity, noise, grid, solver, cond)
                 yield codec.decode(
                     state,
-                    uniform_noise,
+                    draws,
                     None if own is None else {str(self.condition): own},
                 )
 
     def _flow(
         self, condition: Tensor | None, guidance: float, grid: Sequence[float]
     ) -> tuple[Velocity, Tensor | None]:
+    def draw_noise(
+        self, seed: int, indices: Sequence[int], sensor: Sensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """The noise (B, ...) that flows start from, and that of a decoder that draws, for a
+        sensor's grid."""
+        codec = self.codec
+        noise = gaussian(seed, indices, codec.shape, self.device)
+        if not codec.draws:
+            return noise, None
+        shape = (codec.draws, *sensor.shape)
+        return noise, uniform(seed, indices, shape, self.device)
+
         """The velocity to solve on a grid, and its encoded condition: it is encoded once, not at
         every step."""
         options = self.header.conditioning.get(str(self.condition), {})

@@ -22,7 +22,6 @@ from lidar_synth.generate.flow.solvers import mean_velocity, solve
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.noise import gaussian, uniform
 
 START = 0.6
 """Latest time of the noise from which a hole is sampled: the provisional content keeps its large
@@ -119,13 +118,8 @@ def _batch(
     known = codec.encode(generator.tensors.from_images(images).to(device))
     mask = torch.from_numpy(np.stack(holes)).to(device, torch.float32)[:, None]
     inside = adaptive_max_pool2d(mask, codec.shape[1:]) > 0
-    noise = gaussian(seed, indices, codec.shape, device)
     sensor = generator.header.sensor
-    draws = (
-        uniform(seed, indices, (codec.draws, *sensor.shape), device)
-        if codec.draws
-        else None
-    )
+    noise, draws = generator.draw_noise(seed, indices, sensor)
     with torch.inference_mode():
         state = codec.decode(_sample(generator, known, noise, inside, start), draws)
     results = []
