@@ -141,6 +141,11 @@ def test_a_generator_casts_the_objects_of_its_layouts(
     assert len(drawn.boxes) >= len(plain.boxes) >= 5
     lone = Generated(model, condition=[layout], steps=1)
     assert source.identity != lone.identity and source.fields == lone.fields
+    smaller = replace(bank.boxes, values=0.9 * bank.boxes.values)
+    other = Generated(
+        model, condition=[layout], objects=bank.fit_sizes(smaller), steps=1
+    )
+    assert source.identity != other.identity
     mixed = MixedScans(None, source, 1.0, "boxes", epoch_size=1, compare=False)
     assert len(mixed[0]["boxes"]) == len(drawn.boxes)
 

@@ -131,6 +131,8 @@ def test_a_cache_keeps_the_latest(
     assert made == [0, 1, 2, 1]
     with pytest.raises(ConfigError, match="cache=-1"):
         Generated(generator, cache=-1)
+    with pytest.raises(ConfigError, match="option 'stepz'.* Did you mean 'steps'"):
+        Generated(generator, stepz=1)
 
 
 def test_a_conditional_model_takes_its_conditions_in_turn(

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from typing_extensions import Unpack
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.hub import Repository, push
 from lidar_synth.generate import boxed
 from lidar_synth.generate.card import model_card
@@ -63,6 +63,9 @@ class SamplingOptions(TypedDict, total=False):
     guidance: float
 
 
+_OPTIONS = dict.fromkeys(("objects", *SamplingOptions.__annotations__))
+
+
 @dataclass(frozen=True)
 class Generator:
     """A generative model; a scan is a function of (seed, index). ``load_generator`` loads one.
@@ -98,11 +101,11 @@ class Generator:
     path: Path | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.batch, int) or self.batch < 1:
+            raise ConfigError(f"batch={self.batch}", "a number of scans, at least 1")
         own = self.header.sensor.columns
         widths = getattr(self.autoencoder, "widths", (own,))
         if self.columns is not None and self.columns not in widths:
-        if not isinstance(self.batch, int) or self.batch < 1:
-            raise ConfigError(f"batch={self.batch}", "a number of scans, at least 1")
             raise ConfigError(
                 f"{self.columns} columns of {self.name!r}",
                 f"one of {', '.join(map(str, widths))}",
@@ -240,11 +243,11 @@ class Generator:
             DataError: on a condition of another shape or with invalid values, or if a condition is
                 missing.
         """
+        if not len(indices):
+            return []
         given = self._condition(condition, len(indices))
         laid = self.condition == "layout"
         boxes = boxed.boxes_of(condition, len(indices)) if laid else None
-        if not len(indices):
-            return []
         cast = boxes is not None and isinstance(objects, boxed.Drawer)
         if objects is not None and not cast:
             raise ConfigError(
@@ -338,9 +341,6 @@ class Generator:
                     None if own is None else {str(self.condition): own},
                 )
 
-    def _flow(
-        self, condition: Tensor | None, guidance: float, grid: Sequence[float]
-    ) -> tuple[Velocity, Tensor | None]:
     def draw_noise(
         self, seed: int, indices: Sequence[int], sensor: Sensor
     ) -> tuple[Tensor, Tensor | None]:
@@ -353,6 +353,9 @@ class Generator:
         shape = (codec.draws, *sensor.shape)
         return noise, uniform(seed, indices, shape, self.device)
 
+    def _flow(
+        self, condition: Tensor | None, guidance: float, grid: Sequence[float]
+    ) -> tuple[Velocity, Tensor | None]:
         """The velocity to solve on a grid, and its encoded condition: it is encoded once, not at
         every step."""
         options = self.header.conditioning.get(str(self.condition), {})
@@ -420,8 +423,8 @@ class Generated:
         sampling: objects, steps, solver and guidance, as for ``Generator.scans``.
 
     Raises:
-        ConfigError: on a negative cache, a conditional model without conditions, or conditions for
-            an unconditional model.
+        ConfigError: on a negative cache, an unknown option, a conditional model without
+            conditions, or conditions for an unconditional model.
 
     Example:
         >>> from lidar_synth import load_generator, open_scans
@@ -447,6 +450,8 @@ class Generated:
     ) -> None:
         if cache < 0:
             raise ConfigError(f"cache={cache}", "a number of scans")
+        for name in sampling:
+            choose("sampling option", name, _OPTIONS)
         if (condition is None) != (generator.condition is None):
             raise ConfigError(
                 f"{'no conditions' if condition is None else 'conditions'} for {generator.name!r}",
@@ -476,7 +481,11 @@ class Generated:
     def identity(self) -> str:
         """The checkpoint, the seed, the sampling options and the conditions as one text."""
         model = self.generator.hash or self.generator.name
-        options = {k: v for k, v in sorted(self._sampling.items()) if v is not None}
+        options = {
+            k: getattr(v, "identity", v)
+            for k, v in sorted(self._sampling.items())
+            if v is not None
+        }
         conditions = "" if self.condition is None else identity_of(self.condition)
         return f"generated:{model}:{self.seed}:{options}:{conditions}{self.generator.variant}"
 

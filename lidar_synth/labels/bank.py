@@ -30,7 +30,7 @@ from typing_extensions import Self
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import write_arrays
+from lidar_synth.files.disk import hash_of_names, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
@@ -309,6 +309,12 @@ class ObjectBank:
 
     def __len__(self) -> int:
         return len(self.boxes)
+
+    @property
+    def identity(self) -> str:
+        """A text that tells banks apart, by their boxes."""
+        boxes = (*self.boxes.names, *map(str, self.boxes.values.flat))
+        return f"{type(self).__name__}:{self.sensor.name}:{hash_of_names(boxes)[:16]}"
 
     def __repr__(self) -> str:
         return f"ObjectBank({len(self)} objects, {len(self.points)} points, {self.sensor.name})"
