@@ -77,10 +77,7 @@ def verify(root: str | Path, progress: bool = True) -> list[Problem]:
     shards = {name for name in folder.sizes() if name.endswith(".h5")}
     return (
         problems
-        + [
-            Problem(name, UNLISTED)
-            for name in sorted(shards - index.by_file.keys())
-        ]
+        + [Problem(name, UNLISTED) for name in sorted(shards - index.by_file.keys())]
         + check_side_files(folder, index)
     )
 
