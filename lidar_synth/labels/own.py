@@ -5,7 +5,7 @@ They return a new ``Scan`` that shares its unchanged arrays. They remove ``raw_l
 which would contradict the labels that they set.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 
 import numpy as np
@@ -108,6 +108,7 @@ class KeepLabels:
         return trust_labels(scan, label_of(scan), scan.confidence, self.threshold)
 
 
+@dataclass(frozen=True)
 class KeepCondition(KeepLabels):
     """``condition``: the labels of the semantic map that conditioned the scan, with
     confidence 1.
@@ -119,6 +120,8 @@ class KeepCondition(KeepLabels):
         >>> bool((scan.confidence[scan.label < 255] == 1).all())
         True
     """
+
+    threshold: float = field(default=0.0, init=False)
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         return super().__call__(replace(scan, confidence=None), rng)
