@@ -9,7 +9,6 @@ and what to type.
 
 import re
 import shlex
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -266,10 +265,11 @@ def configure(
 
 def _training_scans(root: str) -> str:
     """What opens the split "train" of a folder, as Python; the folder if it has no splits."""
-    with suppress(LidarSynthError):
+    try:
         open_scans(root, split="train")
-        return f'open_scans({root!r}, split="train")'
-    return repr(root)
+    except LidarSynthError:
+        return repr(root)
+    return f'open_scans({root!r}, split="train")'
 
 
 def write_files(files: dict[str, str], folder: Path) -> None:
