@@ -306,9 +306,7 @@ def plain(samples: list[Any]) -> list[str]:
 @pytest.mark.parametrize(
     ("workers", "start"), [(0, None), (2, None), (1, "spawn")], ids=str
 )
-def test_workers_follow_the_epoch(
-    cases: Path, workers: int, start: str | None
-) -> None:
+def test_workers_follow_the_epoch(cases: Path, workers: int, start: str | None) -> None:
     train = planned(cases, "generated")
     loader = DataLoader(
         train,  # type: ignore[arg-type]
