@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Scan
@@ -42,7 +43,8 @@ class Trajectory:
         self.poses = np.asarray(poses, np.float64)
         self._check()
         turn = self.poses[:, :3, :3]
-        self._steps = rotation_vectors(turn[:-1].swapaxes(1, 2) @ turn[1:])
+        steps = Rotation.from_matrix(turn[:-1].swapaxes(1, 2) @ turn[1:])
+        self._steps = steps.as_rotvec()
 
     def _check(self) -> None:
         count = len(self.times) if self.times.ndim == 1 else 0
@@ -55,8 +57,10 @@ class Trajectory:
                 "finite seconds, one after the other",
             )
         turn = self.poses[:, :3, :3]
-        if not np.isfinite(self.poses).all() or not np.allclose(
-            turn @ turn.swapaxes(1, 2), np.eye(3), atol=1e-4
+        if not (
+            np.isfinite(self.poses).all()
+            and np.allclose(turn @ turn.swapaxes(1, 2), np.eye(3), atol=1e-4)
+            and (np.linalg.det(turn) > 0).all()
         ):
             raise DataError(
                 "poses whose upper left 3 x 3 part is not a rotation",
@@ -68,10 +72,8 @@ class Trajectory:
         pose = np.eye(4)
         segment, fraction = self._segments(np.array([time]))
         pose[:3, 3] = self._positions(segment, fraction)[0]
-        turned = rotate(
-            np.eye(3), np.broadcast_to(self._steps[segment] * fraction[:, None], (3, 3))
-        )
-        pose[:3, :3] = self.poses[segment[0], :3, :3] @ turned.T
+        turned = Rotation.from_rotvec(self._steps[segment[0]] * fraction)
+        pose[:3, :3] = self.poses[segment[0], :3, :3] @ turned.as_matrix()
         return pose
 
     def from_world(self, points: Floats, times: Floats) -> Floats:
@@ -173,25 +175,9 @@ def _times(scan: Scan, moment: float) -> Floats:
     return moment + scan.time.astype(np.float64)
 
 
-def rotation_vectors(turns: Floats) -> Floats:
-    """(K, 3) axis times angle, radians, of rotations (K, 3, 3) by less than half a turn."""
-    skew = np.stack(
-        [
-            turns[:, 2, 1] - turns[:, 1, 2],
-            turns[:, 0, 2] - turns[:, 2, 0],
-            turns[:, 1, 0] - turns[:, 0, 1],
-        ],
-        1,
-    )
-    sine = np.linalg.norm(skew, axis=1) / 2
-    angle = np.arctan2(sine, (np.trace(turns, axis1=1, axis2=2) - 1) / 2)
-    return np.asarray(
-        skew * np.where(sine > 1e-9, angle / np.maximum(2 * sine, 1e-12), 0.5)[:, None]
-    )
-
-
 def rotate(points: Floats, vectors: Floats) -> Floats:
     """(N, 3) points turned by rotation vectors (N, 3) or (3,), radians (Rodrigues' formula)."""
+    # not by scipy, whose earlier versions take no empty scan
     angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
     axis = vectors / np.maximum(angle, 1e-12)
     along = np.sum(axis * points, -1, keepdims=True)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lidar_synth.geometry.deskew import rotate
 
@@ -257,7 +258,7 @@ def _moved(model: Model, step: Floats) -> Model:
     beams = len(model.tangents)
     shift = step[2 * beams : 2 * beams + 3]
     tilt = step[2 * beams + 3 : 2 * beams + 6]
-    turned = rotate(np.eye(3), np.broadcast_to(tilt, (3, 3))).T
+    turned = Rotation.from_rotvec(tilt).as_matrix()
     motion = model.motion + step[2 * beams + 6 :].reshape(-1, 6)
     return Model(
         tangents=model.tangents + step[: 2 * beams : 2],

@@ -13,8 +13,8 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from lidar_synth.geometry.deskew import rotate
 from lidar_synth.geometry.lines import CAP, Cloud, Model, nearest_beams, residuals
 from lidar_synth.geometry.scan import spread
 
@@ -162,9 +162,8 @@ def _sharpen(
 
 def tilt_of(angles: Floats) -> Floats:
     """(3, 3) rotation by small angles about x and y, radians."""
-    return rotate(
-        np.eye(3), np.broadcast_to(np.array([angles[0], angles[1], 0.0]), (3, 3))
-    ).T
+    turned = Rotation.from_rotvec([angles[0], angles[1], 0.0])
+    return np.asarray(turned.as_matrix())
 
 
 def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
