@@ -65,6 +65,18 @@ def test_a_scan_is_edited_once_in_a_folder_and_by_the_same_call(
     assert files(out).items() > before.items()
 
 
+def test_all_scans_are_edited_once_in_a_folder(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    call("remove", source, out, "--box", 0)
+    before = files(out)
+    assert len(before) == 3  # two scans, and one claim for both
+    call("remove", source, out, "--box", 0)
+    for other in [("--box", 1), ("--box", 1, "--scan", 1)]:
+        with pytest.raises(ConfigError, match=r"was filled with .*another folder"):
+            call("remove", source, out, *other)
+    assert files(out) == before
+
+
 def test_a_class_without_a_box_writes_nothing(source: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="expected the class of some box"):
         call("remove", source, tmp_path / "out", "--name", "Dragon")

@@ -169,8 +169,8 @@ def _edit(
 ) -> Any:
     """Write one scan of a source, or all, as they are after a change; the last one.
 
-    Several edits may share a folder, each of other scans: beside a scan stands the call that wrote
-    it, which may be run again.
+    Several edits of single scans may share a folder, each of another scan: beside it stands the
+    call that wrote it, which may be run again.
     """
     from lidar_synth.errors import ConfigError, choose
     from lidar_synth.files.claims import claim
@@ -190,11 +190,13 @@ def _edit(
             "the class of some box in these scans, such as KITTI's or the town's",
         )
     call = f"{context.info_name} {context.params | {'out': None}}"
-    with writer.hold(".edit.json", {"format": to}, scans):
+    of_all = call if number is None else None
+    with writer.hold(".edit.json", {"format": to, "edit": of_all}, scans):
         report = Report(len(chosen), left_out=writer.carry(scans))
         for index in chosen:
             edited = change(scans[index])
-            claim(writer.root / f".edit-{index}.json", {"edit": call})
+            if number is not None:
+                claim(writer.root / f".edit-{index}.json", {"edit": call})
             camera = scans.calibration(index)
             writer.write(edited, index, name=scans.ids[index], calibration=camera)
             report.lost.update(writer.loses(edited, camera))

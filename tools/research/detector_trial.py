@@ -41,6 +41,7 @@ from lidar_synth.lab.proof.detection.scores import Truth, precisions
 from lidar_synth.lab.proof.machine import machine
 from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.mixing import Sources, SyntheticFirst
+from lidar_synth.mixing.defaults import PASTED, augment_boxes
 
 LABELLED = 30
 TRAIN_TOWN = 7
@@ -51,8 +52,6 @@ LAYOUT_TOWNS = (20, 21)
 UNBOXED_MODEL = "town"
 BATCH = 2
 RATE = 3e-3
-PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
-"""Maximum number of objects that GT sampling pastes into a scan."""
 BASE = "gt_sampling"
 """The arm with which the others are compared."""
 
@@ -203,9 +202,6 @@ def mixture(
     objects = ObjectBank.from_scans(labelled)
     there = {name: most for name, most in PASTED.items() if name in objects.boxes.names}
     options = {"bank": objects, "count": there, "turn": 180.0, "clear": False}
-    steps: list[Any] = [{"yaw": {"limit": 45}}, "flip_x", "flip_y", "scale"]
-    if arm.pasted:
-        steps.insert(0, {"paste": options})
     share = SyntheticFirst(EPOCHS) if arm.first else arm.share
     return MixedScans(
         labelled,
@@ -215,7 +211,7 @@ def mixture(
         seed=seed,
         balanced=True,
         epoch_size=epoch_size,
-        augment=steps,
+        augment=augment_boxes([objects] if arm.pasted else []),
         augment_real=True,
         to_sample=sample,
         collate=collate,
