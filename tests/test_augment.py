@@ -274,7 +274,7 @@ def test_far_returns_are_lost_more_often() -> None:
 @pytest.mark.parametrize(
     ("step", "message"),
     [
-        (partial(augment.yaw, limit=200), "limit=200"),
+        (partial(augment.yaw, limit=200), "limit 200"),
         (partial(augment.flip_x, chance=2), "chance 2"),
         (partial(augment.scale, low=0, high=1), "low=0"),
         (partial(augment.scale, low=1.1, high=1), "low=1.1"),

@@ -173,7 +173,7 @@ def test_a_conversion_into_a_folder_of_another_grid_leaves_nothing_behind(
     write_all("kitti", tmp_path / "out", [a_scan()])
     write_all("npz", tmp_path / "in", [a_scan(SENSORS["beams"])])
     before = files(tmp_path / "out")
-    with pytest.raises(ConfigError, match="which holds scans of sensor 'os1_128'"):
+    with pytest.raises(ConfigError, match="holds scans that this command did not"):
         convert(
             open_scans(tmp_path / "in"),
             WRITERS["kitti"](tmp_path / "out"),
@@ -181,13 +181,6 @@ def test_a_conversion_into_a_folder_of_another_grid_leaves_nothing_behind(
             progress=False,
         )
     assert files(tmp_path / "out") == before
-    others = open_scans(tmp_path / "in")
-    convert(
-        others,
-        WRITERS["kitti"](tmp_path / "out"),
-        as_sensor=SENSORS["preset"],
-        progress=False,
-    )
 
 
 def test_a_folder_of_several_origins_lists_all_of_them(tmp_path: Path) -> None:

@@ -432,7 +432,7 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
             {"synthetic": "town"},
             "synthetic: town; expected a bank. lidar-synth bake OUT",
         ),
-        ({"unknown": 1}, "settings .'unknown'"),
+        ({"unknown": 1}, "setting of a mixture 'unknown'"),
     ],
 )
 def test_mixtures_that_need_the_package_in_the_trainer_are_refused(

@@ -303,7 +303,7 @@ def test_damaged_and_missing_files(tmp_path: Path) -> None:
         with pytest.raises(
             DataError, match="scans-000001.tar is truncated, damaged or not a tar file"
         ):
-            convert([some_scan()], WebDatasetWriter(tmp_path), progress=False)
+            WebDatasetWriter(tmp_path).complete(0)
     path.write_bytes(content)
     scans = open_scans(tmp_path)
     path.unlink()

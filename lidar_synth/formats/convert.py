@@ -125,9 +125,7 @@ def convert(
         raise ConfigError(f"{jobs} jobs", "at least 1")
     change = _change(as_sensor)
     if isinstance(source, ScanFiles):
-        source.check_sensor()  # both first, so that a wrong sensor leaves no settings behind
-        target = source.sensor if change is None else change.transfer.target
-        writer.require_grid(target.by_beams() if unfold else target)
+        source.check_sensor()  # first, so that a wrong sensor leaves no settings behind
     models = models_of(source.root) if isinstance(source, ScanFiles) else []
     settings = _settings(source, writer, change, unfold)
     with writer.hold(SETTINGS, settings, source):
