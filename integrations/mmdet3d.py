@@ -334,7 +334,7 @@ def _checked(dataset: Any) -> list[SlotFolder]:
             raise ConfigError(
                 f"a dataset with {len(each)} of the {listed} entries of {each.ann_file}",
                 "all of them",
-                "Leave indices out; real scans alone are fewer by a shorter list of them.",
+                "Leave indices, scene_idxs and filters out; fewer real scans: a shorter list.",
             )
     return folders
 

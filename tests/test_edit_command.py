@@ -44,7 +44,7 @@ def test_recorded_scans_in_the_folder_stay_as_they_are(
 ) -> None:
     write_all("npz", tmp_path / "mine", [SCAN])
     before = files(tmp_path / "mine")
-    with pytest.raises(ConfigError, match="mine holds scans that this command did not"):
+    with pytest.raises(ConfigError, match="mine holds files that this command did not"):
         call("remove", source, tmp_path / "mine", "--box", 0)
     assert files(tmp_path / "mine") == before
 

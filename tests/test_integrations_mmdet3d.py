@@ -37,7 +37,7 @@ from layouts import write_all
 from lidar_synth.integrations.detection import write_gt_database
 from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
-from lidar_synth.integrations.mmdet3d_slots import Folder, open_folder, read_url
+from lidar_synth.integrations.mmdet3d_slots import SlotFolder, open_folder, read_url
 from mmdet3d.registry import DATASETS, TRANSFORMS
 from mmdet3d_parts import CONFIGS, DATA_KEYS, bare, flat
 from mmengine.config import Config
@@ -506,7 +506,7 @@ def test_other_synthetic_scans_than_the_lists_are_noticed(
     )
     next(source.rglob("*.npz")).unlink()
     with pytest.raises(DataError, match="not those of the list"):
-        Folder.open(tmp_path / "seg")
+        SlotFolder.open(tmp_path / "seg")
 
 
 def test_classes_that_do_not_fit_are_refused(made: Path) -> None:

@@ -144,7 +144,7 @@ def test_an_augmentation_that_removes_boxes_is_refused_for_a_detector(
         logged(recipe, caplog)
     caplog.clear()
     [message] = logged(MixedScans(real, [street(9)], 0.5, **options), caplog)
-    assert "augment= removes boxes" in message
+    assert "augment= removes the boxes" in message
 
 
 def test_names_that_differ_by_capitals_are(caplog: pytest.LogCaptureFixture) -> None:
@@ -164,7 +164,7 @@ def test_real_scans_that_are_not_finite_are_refused_or_reported(
     nan = np.full_like(real[0].reflectance, np.nan)
     real[0] = replace(real[0], reflectance=nan)
     [message] = logged(MixedScans(real, Endless(), 0.5), caplog)
-    assert "'r0' has reflectances up to nan" in message
+    assert "'r0' has returns of reflectance NaN" in message
     real[0] = replace(real[0], points=real[0].points * np.float32(np.nan))
     with pytest.raises(DataError, match="'r0' with points that are NaN"):
         logged(MixedScans(real, Endless(), 0.5), caplog)

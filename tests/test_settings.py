@@ -1,5 +1,6 @@
 """Settings of a mixture from YAML, and what its parts print about themselves."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -105,3 +106,20 @@ def test_sources_say_what_they_are_in_two_lines(tmp_path: Path) -> None:
             or "(8 x 32" in text
             or "real: Scans; synthetic: Endless" in text
         )
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_the_settings_of_the_trainers_page_make_a_mixture(
+    by_hand: bool, tmp_path: Path
+) -> None:
+    page = Path(__file__).parents[1] / "docs/how-to/trainers/index.md"
+    [text] = re.findall("```yaml\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+    fields = ("reflectance", "label", "confidence")
+    write_bank(tmp_path / "bank", [some_image(i) for i in range(4)], fields=fields)
+    if by_hand:  # all but what needs a file, or a trainer of one kind
+        text = re.sub("^# (?!/data|classes|as_sensor)", "", text, flags=re.MULTILINE)
+        text = text.replace("epochs:", "# epochs:", 1)
+    path = tmp_path / "mix.yaml"
+    path.write_text(text.replace("/data/bank", str(tmp_path / "bank")))
+    mixed = mix_for_trainer(12, read_settings(path), as_is, weighs=True)
+    assert len(mixed) == (16 if by_hand else 100)

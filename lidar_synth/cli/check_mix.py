@@ -1,5 +1,6 @@
 """``lidar-synth check-mix``: compares the scans of a mixture with real ones before training."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -65,8 +66,9 @@ def check_mix(
     # Ids of the trainer's files; here both kinds have train ids.
     settings.pop("classes", None)
     mixture = make_mixture(len(source), settings, weighs=True)
-    epoch = next((e for e in range(100) if mixture.plan(e).synthetics), 0)
-    mixture.set_epoch(epoch)
+    with suppress(ConfigError):  # the schedule ends
+        epochs = (e for e in range(100) if mixture.plan(e).synthetics)
+        mixture.set_epoch(next(epochs, 0))
     chosen = [i for i in range(len(mixture)) if mixture.domain(i)][:count]
     if not chosen:
         raise ConfigError("a mixture without synthetic scans", "a ratio above 0")

@@ -124,9 +124,10 @@ def convert(
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
     change = _change(as_sensor)
+    models = []
     if isinstance(source, ScanFiles):
         source.check_sensor()  # first, so that a wrong sensor leaves no settings behind
-    models = models_of(source.root) if isinstance(source, ScanFiles) else []
+        models = models_of(source.root)
     settings = _settings(source, writer, change, unfold)
     with writer.hold(SETTINGS, settings, source):
         work = partial(convert_one, source, writer, change, unfold, on_bad, strict)

@@ -268,9 +268,11 @@ class KITTIObjectWriter(Writer):
 
     def loses(self, scan: Scan, camera: Calibration | None) -> list[str]:
         lost = super().loses(scan, camera)
+        if scan.boxes is None or "boxes" in lost:
+            return lost
         camera = camera or self.calibration or OBJECT_CAMERA
         camera = replace(camera, image_size=assumed_size(camera))
-        if scan.boxes is not None and (in_image(scan.boxes, camera)[0] < 0).any():
+        if (in_image(scan.boxes, camera)[0] < 0).any():
             lost.append("boxes outside the camera's view")
         return lost
 

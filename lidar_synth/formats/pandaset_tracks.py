@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import name_errors, read_text
@@ -147,6 +146,8 @@ def _transform(pose: Any) -> Matrix:
         raise DataError(
             f"a heading of length {np.linalg.norm(quaternion):g}", "a unit quaternion"
         )
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     result = np.eye(4)
     result[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
     result[:3, 3] = _numbers(pose.get("position"), "x", "y", "z")

@@ -44,7 +44,6 @@ from lidar_synth.formats.points import check_scan, write_points
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, RangeImage, Scan
-from lidar_synth.geometry.sensor import Sensor
 
 Image = NDArray[np.uint8]
 Picture = Image | Path
@@ -132,7 +131,10 @@ class Writer(ABC):
             FileError: if the folder cannot be written or the disk is full.
             DataError: on a scan that a reader would refuse, or that the layout cannot represent.
         """
-        self.require_grid(scan.sensor)
+        if self._description is None and (self.root / NAME).is_file():
+            self._description = read_description(self.root)
+        if self._description is not None:
+            require_grid(self.root, self._description, scan.sensor)
         where = f"scan {scan.id!r}"
         check_facts(scan, where)
         typed: dict[str, Any] = to_stored(
@@ -165,23 +167,10 @@ class Writer(ABC):
         there = self.root.rglob(f"*{self.path(0).suffix}")
         if not path.is_file() and (scan := next(there, None)):
             raise ConfigError(
-                f"{self.root} holds scans that this command did not write, such as {scan}",
+                f"{self.root} holds files that this command did not write, such as {scan}",
                 "a new or an empty folder",
             )
         return hold_claim(path, settings)
-
-    def require_grid(self, sensor: Sensor) -> None:
-        """Refuse a sensor if the folder is described (``scans.json``) as holding scans on another
-        grid.
-
-        Raises:
-            ConfigError: if it is.
-            FileError, DataError: if the description cannot be read or is damaged.
-        """
-        if self._description is None and (self.root / NAME).is_file():
-            self._description = read_description(self.root)
-        if self._description is not None:
-            require_grid(self.root, self._description, sensor)
 
     def _write_points(self, path: Path, scan: Scan) -> None:
         """Write the points of a scan as ``.bin``, which has no room for a description: it is

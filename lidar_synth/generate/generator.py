@@ -101,7 +101,7 @@ class Generator:
     path: Path | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.batch, int) or self.batch < 1:
+        if not isinstance(self.batch, int | np.integer) or self.batch < 1:
             raise ConfigError(f"batch={self.batch}", "a number of scans, at least 1")
         own = self.header.sensor.columns
         widths = getattr(self.autoencoder, "widths", (own,))

@@ -121,7 +121,7 @@ class KeepCondition(KeepLabels):
         True
     """
 
-    threshold: float = field(default=0.0, init=False)
+    threshold: float = field(default=0.0, init=False, repr=False)
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         return super().__call__(replace(scan, confidence=None), rng)

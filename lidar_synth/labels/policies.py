@@ -120,6 +120,6 @@ def _check_arguments(name: str, kind: type, arguments: Any) -> dict[str, Any]:
         raise ConfigError(
             f"labels={name!r}: {error}",
             f"arguments {', '.join(known)}" if known else "no arguments",
-            "".join(suggest(word, known) for word in lowered if word not in known),
+            next((suggest(word, known) for word in lowered if word not in known), ""),
         ) from error
     return lowered

@@ -294,7 +294,8 @@ def _unknown_values(dataset: Any, real: Any, synthetic: Any) -> Iterator[str]:
     for place in [p for p in labels if p in real_labels]:
         known = real_labels[place]
         if len(known) > FEW:
-            if _may_be_labels(place):
+            # instances in the upper 16 bits
+            if max(known) > 0xFFFF and len({int(v) & 0xFFFF for v in known}) <= FEW:
                 yield (
                     f"{place} has {len(labels[place])} different values instead of {len(known)}: "
                     "instance ids in the upper bits? `& 0xFFFF`"

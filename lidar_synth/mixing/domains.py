@@ -16,23 +16,22 @@ from lidar_synth.mixing.schedules import Schedule, make_schedule, share_of
 Forward = Callable[[nn.Module, Any], Any]
 
 
-def make_weight(given: Any, epoch: int = 0) -> Schedule:
+def make_weight(given: Any) -> Schedule:
     """The weight of synthetic samples in the loss, by epoch.
 
     Args:
         given: a number from 0 to 1, or one by epoch, as a ratio (``make_schedule``).
-        epoch: one that must have a weight.
 
     Raises:
         ConfigError: on anything else.
     """
     try:
         schedule = make_schedule(given)
-        share_of(schedule, epoch)
+        share_of(schedule, 0)
         return schedule
     except ConfigError as error:
         raise ConfigError(
-            f"loss_weight={given!r} in epoch {epoch}",
+            f"loss_weight={given!r}",
             "the weight of synthetic samples in the loss, from 0 to 1, or one by epoch, such as "
             "{0: 1.0, 10: 0.1}",
         ) from error

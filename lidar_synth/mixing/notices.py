@@ -7,6 +7,7 @@ tell real from synthetic, a bank used very often.
 import logging
 from statistics import median
 
+import numpy as np
 from torch.utils.data import get_worker_info
 
 from lidar_synth.datasets.classes import IGNORE
@@ -68,7 +69,9 @@ class Notices:
     def real(self, scan: Scan) -> None:
         """Report a reflectance above 1 or NaN, and boxes that are not known; note whether real
         scans have boxes and labels, and their numbers of points."""
-        if not (scan.reflectance <= 1).all():
+        if np.isnan(scan.reflectance).any():
+            self._warn("real scan %r has returns of reflectance NaN", scan.id)
+        elif (scan.reflectance > 1).any():
             self._warn(
                 "real scan %r has reflectances up to %g, synthetic ones up to 1: the scale tells "
                 "them apart. Divide them where the Scan is made, intensities of 0 to 255 by 255.",
@@ -142,7 +145,10 @@ class Notices:
                 "one that keeps them, with labels='boxes' or 'paste'",
                 "For a segmenter, {'paste': {'clear': 'same'}} gives scans without boxes none.",
             )
-        self._warn("augment= removes boxes, of which a detector learns")
+        self._warn(
+            "augment= removes the boxes of scans: a detector would learn that their objects are "
+            "background"
+        )
 
     def synthetic(self, given: Scan, scan: Scan) -> None:
         """Report the unboxed objects of a synthetic scan, or that synthetic scans have no boxes

@@ -163,7 +163,7 @@ class MixedScans(Dataset[Any]):
                 "augment_real=False",
                 "Augment real samples in your dataset.",
             )
-        if not isinstance(epoch_size, str):
+        if isinstance(epoch_size, np.integer):
             epoch_size = to_integer(epoch_size, "epoch_size")
         if locality not in (None, "shard"):
             raise ConfigError(f"locality={locality!r}", '"shard", or None')
@@ -222,8 +222,8 @@ class MixedScans(Dataset[Any]):
         self.set_epoch(0)
         self._untold = self._take_earlier()
         if real_as_is and compare:
-            weights = {*self._loss_weights, self.synthetic_weight}
-            weighs = weights != {1, make_weight(1)}
+            weighs = self.synthetic_weight != make_weight(1)
+            weighs |= any(weight != 1 for weight in self._loss_weights)
             check_alike(self.real, self.synthetic, self._maker.synthetic, weighs)
 
     def _take_earlier(self) -> bool:
@@ -339,7 +339,13 @@ class MixedScans(Dataset[Any]):
             ConfigError: on an epoch for which there is no ratio or no weight.
         """
         MixingPlan(self.mixture, epoch)
-        make_weight(self.synthetic_weight, epoch)
+        try:
+            share_of(self.synthetic_weight, epoch)
+        except ConfigError as error:
+            raise ConfigError(
+                f"loss_weight= that gives no weight from 0 to 1 in epoch {epoch}",
+                "one for every epoch, or {epoch: weight}, whose last weight stays",
+            ) from error
         if self._untold:
             self._untold = False
             self.current.forget_pass()

@@ -286,5 +286,5 @@ def check_uniform(grid: Sequence[float]) -> None:
         raise ConfigError(
             f"time grid {tuple(grid)}",
             f"{uniform}, which is uniform",
-            "Give grid=null, or strategy=adaptive_piecewise.",
+            "Or take adaptive_piecewise, or no grid (in a recipe grid=null).",
         )

@@ -73,8 +73,6 @@ def evaluate(
         check_counts(rules, len(real), len(generated))
     if not training_data and (note := refuse_training_data(real, generated)):
         warnings.warn(note, stacklevel=2)
-    if processes > 1:
-        _fill(rules, (real, generated), weights, cache, processes, batch)
     if replicates and min(len(real), len(generated)) < 2:
         raise DataError(
             f"{len(real)} real and {len(generated)} generated scans",
@@ -83,6 +81,8 @@ def evaluate(
     metric = Metric(
         rules, extractors, weights, replicates, extended, anyway, batch, cache
     )
+    if processes > 1:
+        _fill(rules, (real, generated), weights, cache, processes, batch)
     indices: Sequence[int] = range(len(real))
     if (
         not extractors
