@@ -290,8 +290,8 @@ def test_a_grid_that_is_none_is_refused(grid: str) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (["strategy=uniform_piecewise"], "which is uniform. Give grid=null"),
-        (["strategy=timestep_distillation"], "which is uniform. Give grid=null"),
+        (["strategy=uniform_piecewise"], "which is uniform.*in a recipe grid=null"),
+        (["strategy=timestep_distillation"], "which is uniform.*in a recipe grid=null"),
         (["grid=null", "also=[101]"], "101 steps of selection.candidates=100 times"),
         (["grid=null", "intervals=101"], "Give selection.candidates=101 or more"),
     ],

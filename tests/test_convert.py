@@ -450,7 +450,7 @@ def test_scans_of_others_in_the_folder_are_not_adopted(tmp_path: Path) -> None:
     write_all("semantic_kitti", tmp_path / "in", [some_scan(0)])
     write_all("kitti", tmp_path / "mine", [some_scan(1)])
     before = files(tmp_path / "mine")
-    with pytest.raises(ConfigError, match=r"mine holds scans .*\.bin; expected a new"):
+    with pytest.raises(ConfigError, match=r"mine holds files .*\.bin; expected a new"):
         convert(
             open_scans(tmp_path / "in"),
             WRITERS["kitti"](tmp_path / "mine"),

@@ -168,7 +168,7 @@ def test_bad_sizes_are_refused() -> None:
     for wrong in ("4", 4.0):
         with pytest.raises(ConfigError, match="batch_size .*; expected a whole number"):
             mixture().loader(batch_size=wrong)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="epoch_size=4.5; expected an integer"):
+    with pytest.raises(ConfigError, match="epoch_size=4.5; expected 'add', 'replace'"):
         MixedScans(Scans("r", 4), Endless(), 0.5, epoch_size=4.5)  # type: ignore[arg-type]
 
 

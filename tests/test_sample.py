@@ -90,7 +90,7 @@ def test_sample_does_not_adopt_recorded_scans(path: Path, tmp_path: Path) -> Non
 
     write_all("kitti", tmp_path, [random_scan(SENSOR, 400, 0)])
     call = ["sample", str(tmp_path), "--model", str(path), "--to", "kitti"]
-    with pytest.raises(ConfigError, match="scans that this command did not write"):
+    with pytest.raises(ConfigError, match="files that this command did not write"):
         CliRunner().invoke(app, call, catch_exceptions=False)
     assert open_scans(tmp_path)[0].domain == REAL
 
