@@ -427,7 +427,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
         (
             "generated",
             {"fields": plain},
-            "keeps labels, but .* the synthetic scans only have.*Use labels='none'",
+            "labels='generated', but .* the synthetic scans only have.*Use labels='none'",
         ),
         (
             "generated",
@@ -442,7 +442,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
         (
             "condition",
             {"fields": plain},
-            "keeps labels, but .* the synthetic scans only have",
+            "labels='condition', but .* the synthetic scans only have",
         ),
         (
             "pseudo",

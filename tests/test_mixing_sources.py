@@ -283,7 +283,7 @@ def batch_of(sample: Any) -> Any:
         ),
         (lambda: mixed(collate="voxels"), ConfigError, r"form='voxels' of batches"),
         (lambda: mixed(unlabelled="skip"), ConfigError, r"unlabelled='skip'"),
-        (lambda: mixed()[15], IndexError, r"index out of range"),
+        (lambda: mixed()[15], IndexError, r"sample 15 of 15"),
         (lambda: mixed().batches(0), ConfigError, r"batch_size 0"),
         (lambda: mixed().batches(2, rank=2, world_size=2), ConfigError, r"rank 2 of 2"),
         (lambda: mixed().batches(2, rank=1), ConfigError, r"rank 1 of None"),

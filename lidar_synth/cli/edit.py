@@ -106,15 +106,11 @@ def insert_object(
     bank = ObjectBank.load(objects)
     if number >= len(bank):
         raise ConfigError(f"--number {number} of {bank}", f"0 to {len(bank) - 1}")
-    edited = _edit(
-        context,
-        source,
-        out,
-        scan,
-        to,
-        lambda given: insert(given, bank[number], _pose(at)),
-    )
-    _print_last(out, edited)
+
+    def change(given: "Scan") -> "Scan":
+        return insert(given, bank[number], _pose(at))
+
+    _print_last(out, _edit(context, source, out, scan, to, change))
 
 
 @edit.command("move")
@@ -137,15 +133,10 @@ def move_object(
     """
     from lidar_synth.labels.edit import move
 
-    edited = _edit(
-        context,
-        source,
-        out,
-        scan,
-        to,
-        lambda given: move(given, box, _pose(at), model=model, seed=seed),
-    )
-    _print_last(out, edited)
+    def change(given: "Scan") -> "Scan":
+        return move(given, box, _pose(at), model=model, seed=seed)
+
+    _print_last(out, _edit(context, source, out, scan, to, change))
 
 
 def _print_last(out: Path, edited: Any) -> None:
@@ -172,6 +163,8 @@ def _edit(
     Several edits of single scans may share a folder, each of another scan: beside it stands the
     call that wrote it, which may be run again.
     """
+    from tqdm import tqdm
+
     from lidar_synth.errors import ConfigError, choose
     from lidar_synth.files.claims import claim
     from lidar_synth.formats import WRITERS, open_scans
@@ -193,7 +186,7 @@ def _edit(
     of_all = call if number is None else None
     with writer.hold(".edit.json", {"format": to, "edit": of_all}, scans):
         report = Report(len(chosen), left_out=writer.carry(scans))
-        for index in chosen:
+        for index in tqdm(chosen, "scans", unit="scan", disable=len(chosen) < 8):
             edited = change(scans[index])
             if number is not None:
                 claim(writer.root / f".edit-{index}.json", {"edit": call})

@@ -97,7 +97,7 @@ class PasteObjects:
         """
         check_own(self.threshold, fields)
         if self.clear == "same":
-            require_label(fields)
+            require_label("paste", fields)
         bound = self
         if self.bank is None:
             bound = replace(self, bank=_collect_objects(real, self.least))

@@ -5,7 +5,7 @@ They return a new ``Scan`` that shares its unchanged arrays. They remove ``raw_l
 which would contradict the labels that they set.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
 
 import numpy as np
@@ -96,7 +96,7 @@ class KeepLabels:
         Raises:
             ConfigError: if they do not.
         """
-        require_label(fields)
+        require_label("generated", fields)
         if self.threshold and "confidence" not in fields:
             raise ConfigError(
                 f"threshold {self.threshold} for synthetic scans without confidence",
@@ -109,7 +109,7 @@ class KeepLabels:
 
 
 @dataclass(frozen=True)
-class KeepCondition(KeepLabels):
+class KeepCondition:
     """``condition``: the labels of the semantic map that conditioned the scan, with
     confidence 1.
 
@@ -121,10 +121,17 @@ class KeepCondition(KeepLabels):
         True
     """
 
-    threshold: float = field(default=0.0, init=False, repr=False)
+    def bind(self, real: Source | None, fields: frozenset[str]) -> "KeepCondition":
+        """Check that the scans have labels.
+
+        Raises:
+            ConfigError: if they do not.
+        """
+        require_label("condition", fields)
+        return self
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        return super().__call__(replace(scan, confidence=None), rng)
+        return trust_labels(scan, label_of(scan), None)
 
 
 @dataclass(frozen=True)
@@ -242,7 +249,7 @@ def check_count(name: str, value: int, least: int) -> None:
         raise ConfigError(given, f"a whole number, {least} or more")
 
 
-def require_label(fields: frozenset[str]) -> None:
+def require_label(policy: str, fields: frozenset[str]) -> None:
     """Check that synthetic scans have labels.
 
     Raises:
@@ -250,7 +257,7 @@ def require_label(fields: frozenset[str]) -> None:
     """
     if "label" not in fields:
         raise ConfigError(
-            "a policy that keeps labels, but besides points the synthetic scans only have "
+            f"labels={policy!r}, but besides points the synthetic scans only have "
             f"{sorted(fields) or 'no fields'}",
             "a model or bank with labels",
             "Use labels='none' for an unlabelled pool, 'ignore', 'pseudo' with a teacher, or "

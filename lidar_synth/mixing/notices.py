@@ -59,7 +59,7 @@ class Notices:
         self._names: set[str] = set()  # of all boxes
         self._boxed = boxed
         self._measured = False
-        # a real scan without labels; "" if that is no matter, or told
+        # a real scan without labels; "" if that is no matter
         self._unlabelled: str | None = "" if boxes else None
         self._labelled = False  # whether a synthetic scan had labels
         self._images = images

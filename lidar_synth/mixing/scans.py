@@ -414,7 +414,11 @@ class MixedScans(Dataset[Any]):
         return self.mixture.length
 
     def __getitem__(self, index: int) -> Any:
-        return self.sample(self.epoch_of(index), range(len(self))[index])
+        epoch = self.epoch_of(index)
+        length = len(self)
+        if not -length <= index < length:
+            raise IndexError(f"sample {index} of {length}")
+        return self.sample(epoch, int(index) % length)
 
     def domain(self, index: int) -> int:
         """The domain of the sample at ``index`` in the current epoch: 0 = real, 1 = synthetic.

@@ -127,8 +127,8 @@ def mix(
             up to 40 real scans of the synthetic scans' lasers: synthetic scans alone in three
             quarters of the epochs, then half, real ones alone in the last twentieth; persons and
             cycles of the town take the place of the synthetic scans' own, unless ``labels`` are
-            given.
-            Otherwise: synthetic scans alone in a quarter of the epochs, then real ones alone.
+            given. Otherwise: synthetic scans alone in a quarter of the epochs, then real ones
+            alone.
         as_sensor: ``"auto"`` turns synthetic scans into scans of the real scans' sensor if theirs
             is another, and where its lasers are others gives them the distribution of
             reflectance of ten real scans; None leaves them as they are; otherwise as for

@@ -2,7 +2,7 @@
 trainers."""
 
 import json
-from dataclasses import asdict, astuple
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,7 +75,7 @@ def _list(as_json: bool) -> None:
         typer.echo(json.dumps([asdict(one) for one in listed], indent=1))
         return
     rows = [("recipe", "command", "data", "parameters", "time")]
-    rows += [astuple(one)[:-1] for one in listed]  # all but the summary
+    rows += [(one.name, one.command, one.data, one.size, one.time) for one in listed]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         typer.echo("  ".join(map(str.ljust, row, widths)).rstrip())

@@ -167,15 +167,24 @@ def figures_of(
             ANY,
         ),
     ]
-    # The first of the others is the discrepancy again.
-    return figures + more_figures(name, real, fake)[1:] if extended else figures
+    return figures + more_figures(name, real, fake) if extended else figures
+
+
+def figures_beside(
+    name: str, real: NDArray[np.floating], fake: NDArray[np.floating]
+) -> list[Figure]:
+    """The figures beside those of a protocol: the unbiased discrepancy, and ``more_figures``."""
+    statistic = polynomial_mmd(real, fake)
+    title = f"unbiased squared maximum mean discrepancy of {name}"
+    unbiased: Figure = (title, lambda: statistic.value, lambda: statistic, ANY)
+    return [unbiased, *more_figures(name, real, fake)]
 
 
 def more_figures(
     name: str, real: NDArray[np.floating], fake: NDArray[np.floating]
 ) -> list[Figure]:
-    """Unbiased forms, precision, recall, density and coverage; those for which there are enough
-    samples."""
+    """The extrapolated Frechet distance, precision, recall, density and coverage; those for which
+    there are enough samples."""
     figures: list[Figure] = []
 
     def add(title: str, statistic: Statistic, limits: tuple[float, float]) -> None:
@@ -183,7 +192,6 @@ def more_figures(
             (f"{title} of {name}", lambda: statistic.value, lambda: statistic, limits)
         )
 
-    add("unbiased squared maximum mean discrepancy", polynomial_mmd(real, fake), ANY)
     try:
         value = extrapolated_frechet(real, fake)
         figures.append(

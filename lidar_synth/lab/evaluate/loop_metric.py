@@ -24,9 +24,9 @@ from lidar_synth.lab.evaluate.distances import frechet_distance
 from lidar_synth.lab.evaluate.features import (
     Extractor,
     Figure,
+    figures_beside,
     figures_of,
     load_extractors,
-    more_figures,
     statistic_of,
 )
 from lidar_synth.lab.evaluate.intervals import FEWEST, LEVEL, bootstrap
@@ -292,7 +292,7 @@ class Metric:
         if self._extended:
             for name in self._published:
                 table = self.protocol.measures[name].table or name
-                figures = more_figures(table, *_join_features(kept, _own(name)))
+                figures = figures_beside(table, *_join_features(kept, _own(name)))
                 scores += self._of_figures(figures, kept)
         if not scores:
             raise DataError(
