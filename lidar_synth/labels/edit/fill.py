@@ -9,6 +9,8 @@ leaves that place; in place of another, the next surface beside the hole that is
 copied, and without one there is no return.
 """
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +72,8 @@ def continue_surfaces(
     ):
         part = slice(first, stop)
         if hole[part].any() and not hole[part].all():
-            given = (
+            ring = _Ring(
+                rays.step,
                 hole[part],
                 known[part],
                 rays.rho[part],
@@ -79,144 +82,170 @@ def continue_surfaces(
                 ground[part],
                 thing[part],
             )
-            _ring(rays.step, *given, donor[part], rho[part])
+            _fill(ring, donor[part], rho[part])
             donor[part] += first * (donor[part] >= 0)
     return donor, rho
 
 
+class _Ring(NamedTuple):
+    """Rays of one ring, the last of which is followed by the first, as of `continue_surfaces`."""
+
+    step: float
+    hole: NDArray[np.bool_]
+    known: NDArray[np.bool_]
+    rho: NDArray[np.float64]
+    near: NDArray[np.float64]
+    far: NDArray[np.float64]
+    ground: NDArray[np.bool_]
+    thing: NDArray[np.bool_]
+
+
+class _Side(NamedTuple):
+    """Rays beside a hole, from its edge outwards.
+
+    Attributes:
+        rays: (S,) their numbers, at most `SIDE`.
+        rho: median distance of the first returns, 0 = none.
+        ground: whether the first return is one of the ground.
+    """
+
+    rays: NDArray[np.int64]
+    rho: float
+    ground: bool
+
+
 @numba.njit(cache=True)
-def _ring(  # type: ignore[no-untyped-def]
-    step, hole, known, rho, near, far, ground, thing, donor, out
-):
-    """Fill the holes of one ring, whose last ray is followed by its first."""
-    count = len(hole)
-    left = np.empty(SIDE, np.int64)
-    right = np.empty(SIDE, np.int64)
-    for i in range(count):
-        if not hole[i] or hole[i - 1]:
-            continue
-        length = 0
-        limit = np.inf
-        while hole[(i + length) % count]:
-            limit = min(limit, near[(i + length) % count])
-            length += 1
-        n = _side(hole, known, rho, ground, thing, i - 1, -1, limit, left)
-        m = _side(
-            hole, known, rho, ground, thing, (i + length) % count, 1, limit, right
-        )
-        a = _edge(known, rho, left, n)
-        b = _edge(known, rho, right, m)
-        # from the middle to the middle of the averaged rays
-        turn = (length + 1 + 2 * _SMOOTH) * step
-        levels = _level(known, ground, left, n), _level(known, ground, right, m)
-        flat = levels[0] and levels[1]
-        mixed = levels[0] != levels[1]
-        same = (
-            min(a, b) > 0
-            and abs(a - b) < SAME * max(a, b)
-            and (turn < WIDE or not mixed)
-        )
-        if min(a, b) > 0 and not same and turn < WIDE:
-            same = abs(_ahead(known, rho, left, n, step, turn) - b) < SAME * b
-            same |= abs(_ahead(known, rho, right, m, step, turn) - a) < SAME * a
-        for k in range(length):
-            share = (k + 1 + _SMOOTH) * step / turn
-            use_left = n > 0 and (m == 0 or share < 0.5)
-            side, size, nth, edge = (
-                (left, n, k, a) if use_left else (right, m, length - 1 - k, b)
+def _fill(ring, donor, out):  # type: ignore[no-untyped-def]
+    """Fill the holes of one ring."""
+    count = len(ring.hole)
+    for first in range(count):
+        if ring.hole[first] and not ring.hole[first - 1]:
+            length = 1
+            while ring.hole[(first + length) % count]:
+                length += 1
+            _fill_hole(ring, first, length, donor, out)
+
+
+@numba.njit(cache=True)
+def _fill_hole(ring, first, length, donor, out):  # type: ignore[no-untyped-def]
+    """Fill the hole of some rays from the first on."""
+    count = len(ring.hole)
+    limit = np.inf
+    for k in range(length):
+        limit = min(limit, ring.near[(first + k) % count])
+    left = _side(ring, first - 1, -1, limit)
+    right = _side(ring, (first + length) % count, 1, limit)
+    # from the middle to the middle of the averaged rays
+    turn = (length + 1 + 2 * _SMOOTH) * ring.step
+    same = _one_surface(ring, left, right, turn)
+    for k in range(length):
+        share = (k + 1 + _SMOOTH) * ring.step / turn
+        between = _between(left, right, turn, share) if same else 0.0
+        ray = (first + k) % count
+        if len(left.rays) and (share < 0.5 or not len(right.rays)):
+            donor[ray], out[ray] = _estimate(
+                ring, left, right, k, between, ring.far[ray]
             )
-            if size == 0:
-                continue
-            source = side[nth % size]
-            j = (i + k) % count
-            donor[j] = source
-            if not known[source]:
-                continue
-            base = edge
-            # Ground that is continued towards a wall would rise.
-            if same and not (mixed and ground[source]):
-                of_a = 1 - share
-                of_b = share
-                if not flat and turn < 3:
-                    of_a = np.sin((1 - share) * turn) / np.sin(turn)
-                    of_b = np.sin(share * turn) / np.sin(turn)
-                base = 1 / (of_a / a + of_b / b)
-            at = nth % size
-            around = min(at, size - 1 - at, _SMOOTH)
-            smooth = _edge(known, rho, side[at - around : at + around + 1], -1)
-            # The source is of another surface than the edge.
-            jump = abs(smooth - edge) > SAME * edge
-            out[j] = rho[source] if jump else base * rho[source] / smooth
-            if not ground[source] and far[j] - INSIDE < out[j] < far[j]:
-                out[j] = far[j]
-            elif not ground[source] and out[j] < far[j]:
-                beyond = _first_beyond(known, rho, side[:size], far[j])
-                if beyond < 0:
-                    beyond = _first_beyond(
-                        known, rho, right[:m] if use_left else left[:n], far[j]
-                    )
-                donor[j] = beyond if beyond >= 0 else source
-                out[j] = rho[beyond] if beyond >= 0 else np.inf
+        elif len(right.rays):
+            nth = length - 1 - k
+            donor[ray], out[ray] = _estimate(
+                ring, right, left, nth, between, ring.far[ray]
+            )
 
 
 @numba.njit(cache=True)
-def _first_beyond(known, rho, side, limit):  # type: ignore[no-untyped-def]
-    """The first ray of a side whose return is farther away than a limit, metres; -1 = none."""
-    for i in side:
-        if known[i] and rho[i] > limit:
-            return i
-    return -1
+def _one_surface(ring, left, right, turn):  # type: ignore[no-untyped-def]
+    """Whether both sides of a hole as wide as an angle show one surface."""
+    a = left.rho
+    b = right.rho
+    if min(a, b) == 0 or (turn >= WIDE and left.ground != right.ground):
+        return False
+    return abs(a - b) < SAME * max(a, b) or (
+        turn < WIDE
+        and (
+            abs(_ahead(ring, left, turn) - b) < SAME * b
+            or abs(_ahead(ring, right, turn) - a) < SAME * a
+        )
+    )
 
 
 @numba.njit(cache=True)
-def _ahead(known, rho, side, size, step, turn):  # type: ignore[no-untyped-def]
+def _between(left, right, turn, share):  # type: ignore[no-untyped-def]
+    """Distance at a share of the way from the left to the right side of one surface."""
+    of_left = 1 - share
+    of_right = share
+    if not (left.ground and right.ground) and turn < 3:
+        of_left = np.sin((1 - share) * turn) / np.sin(turn)
+        of_right = np.sin(share * turn) / np.sin(turn)
+    return 1 / (of_left / left.rho + of_right / right.rho)
+
+
+@numba.njit(cache=True)
+def _estimate(ring, side, other, nth, between, far):  # type: ignore[no-untyped-def]
+    """The ray that the nth ray of a hole is copied from, and its distance, inf = no return.
+
+    ``between`` is its distance on the surface that both sides show, 0 = they show none.
+    """
+    at = nth % len(side.rays)
+    source = side.rays[at]
+    if not ring.known[source]:
+        return source, np.inf
+    ground = ring.ground[source]
+    # Ground that is continued towards a wall would rise.
+    if between == 0 or (ground and side.ground != other.ground):
+        between = side.rho
+    around = min(at, len(side.rays) - 1 - at, _SMOOTH)
+    smooth = _median(ring, side.rays[at - around : at + around + 1])
+    # The source is of another surface than the edge.
+    jump = abs(smooth - side.rho) > SAME * side.rho
+    rho = ring.rho[source] if jump else between * ring.rho[source] / smooth
+    if ground or rho >= far:
+        return source, rho
+    if rho > far - INSIDE:
+        return source, far
+    for rays in (side.rays, other.rays):
+        for beyond in rays:
+            if ring.known[beyond] and ring.rho[beyond] > far:
+                return beyond, ring.rho[beyond]
+    return source, np.inf
+
+
+@numba.njit(cache=True)
+def _ahead(ring, side, turn):  # type: ignore[no-untyped-def]
     """Distance at the other edge of a plane wall through the returns of a side; inf = none."""
-    if size < _BASE + 2 * _SMOOTH + 1:
+    if len(side.rays) < _BASE + 2 * _SMOOTH + 1:
         return np.inf
-    near = _edge(known, rho, side, size)
-    far = _edge(known, rho, side[_BASE : _BASE + 2 * _SMOOTH + 1], -1)
+    far = _median(ring, side.rays[_BASE : _BASE + 2 * _SMOOTH + 1])
     if far == 0:
         return np.inf
-    rise = (np.cos(_BASE * step) / near - 1 / far) / np.sin(_BASE * step)
-    inverse = np.cos(turn) / near + np.sin(turn) * rise
+    rise = (np.cos(_BASE * ring.step) / side.rho - 1 / far) / np.sin(_BASE * ring.step)
+    inverse = np.cos(turn) / side.rho + np.sin(turn) * rise
     return 1 / inverse if inverse > 0 else np.inf
 
 
 @numba.njit(cache=True)
-def _side(hole, known, rho, ground, thing, start, step, limit, out):  # type: ignore[no-untyped-def]
+def _side(ring, start, step, limit):  # type: ignore[no-untyped-def]
     """Collect the rays beside a hole, from its edge outwards, but not those that end on or in front
     of an object."""
+    rays = np.empty(SIDE, np.int64)
     found = 0
-    count = len(hole)
+    count = len(ring.hole)
     for k in range(min(REACH, count)):
         i = (start + k * step) % count
-        front = known[i] and not ground[i] and rho[i] < limit - FRONT
-        if not hole[i] and not front and not thing[i]:
-            out[found] = i
+        front = ring.known[i] and not ring.ground[i] and ring.rho[i] < limit - FRONT
+        if not ring.hole[i] and not front and not ring.thing[i]:
+            rays[found] = i
             found += 1
             if found == SIDE:
                 break
-    return found
+    rays = rays[:found]
+    returns = rays[ring.known[rays]]
+    ground = len(returns) > 0 and ring.ground[returns[0]]
+    return _Side(rays, _median(ring, returns[: 2 * _SMOOTH + 1]), ground)
 
 
 @numba.njit(cache=True)
-def _edge(known, rho, side, size):  # type: ignore[no-untyped-def]
-    """Median distance of the first returns on a side, or with size -1 of all of them; 0 = none."""
-    values = np.empty(len(side))
-    found = 0
-    for i in side if size < 0 else side[:size]:
-        if known[i]:
-            values[found] = rho[i]
-            found += 1
-            if size >= 0 and found == 2 * _SMOOTH + 1:
-                break
-    return np.median(values[:found]) if found else 0.0
-
-
-@numba.njit(cache=True)
-def _level(known, ground, side, size):  # type: ignore[no-untyped-def]
-    """Whether the first return on a side is one of the ground."""
-    for i in side[:size]:
-        if known[i]:
-            return ground[i]
-    return False
+def _median(ring, rays):  # type: ignore[no-untyped-def]
+    """Median distance of the returns among rays; 0 = none."""
+    values = ring.rho[rays[ring.known[rays]]]
+    return np.median(values) if len(values) else 0.0
