@@ -20,8 +20,9 @@ from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.claims import claim
 from lidar_synth.formats import READERS, WRITERS, open_scans
 from lidar_synth.formats.as_sensor import AsSensor
-from lidar_synth.formats.convert import SETTINGS, Report, _settings, convert, reproject
+from lidar_synth.formats.convert import SETTINGS, Report, _settings, convert
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
+from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor, presets
 from lidar_synth.geometry.transfer import Mount, Transfer
@@ -55,7 +56,7 @@ def test_every_layout_becomes_every_format(
     assert type(result) is READERS[WRITTEN_AS[to]] and len(result) == 3
     for expected, scan in zip(source, result, strict=True):
         expected = (
-            reproject(expected, scan.sensor)
+            unproject(project(expected, scan.sensor))
             if to in ("range", "png", "cosmos")
             else expected
         )

@@ -21,8 +21,7 @@ from lidar_synth.formats import OnBad, ScanFiles, Writer
 from lidar_synth.formats.as_sensor import AsSensor
 from lidar_synth.formats.description import NAME, Origin, add_origin
 from lidar_synth.formats.models import models_of, write_models
-from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.projection import unfold as unfold_rings
+from lidar_synth.geometry.projection import unfold, unproject
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer import Transfer
@@ -250,7 +249,7 @@ def convert_one(
         if change is not None:
             scan, seen = change.cast(scan, source, index)
             camera = change.calibration(camera)
-        scan = reproject(scan, unfold=True) if unfold else scan
+        scan = unfolded(scan) if unfold else scan
         lost = writer.loses(scan, camera)
     except (DataError, FileError) as error:
         if on_bad != "skip":
@@ -272,21 +271,14 @@ def convert_one(
     return Outcome(index, "", dropped, Origin.of(scan), seen, tuple(lost), unlabelled)
 
 
-def reproject(scan: Scan, sensor: Sensor | None = None, unfold: bool = False) -> Scan:
-    """Re-project a scan to a sensor's grid: one return per cell, on the ray through the cell's
-    centre.
-
-    Boxes, pose and image stay unchanged.
-
-    Args:
-        scan: N points.
-        sensor: defines the grid; by default the scan's own sensor.
-        unfold: whether rows are lasers instead of equal steps of elevation.
+def unfolded(scan: Scan) -> Scan:
+    """The scan on a grid with one row per laser: one return per cell, on the ray through the cell's
+    centre. Boxes, pose and image stay unchanged.
 
     Raises:
         DataError: on a scan that cannot be unfolded.
     """
-    seen = unproject((unfold_rings if unfold else project)(scan, sensor))
+    seen = unproject(unfold(scan))
     for name in ("boxes", "pose", "image_path", "id", "domain", "provenance"):
         setattr(seen, name, getattr(scan, name))
     return seen
