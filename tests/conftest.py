@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import settings
 
+from lidar_synth.geometry.projection.rings import ring_bounds
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, presets
 
@@ -91,6 +92,12 @@ def golden() -> Golden:
 def sensor(request: pytest.FixtureRequest) -> Sensor:
     """Every preset in turn."""
     return presets()[request.param]
+
+
+def ring_numbers(points: np.ndarray) -> np.ndarray:
+    """(N,) ring of each point, 0 = the first in the file."""
+    bounds = ring_bounds(points)
+    return np.repeat(np.arange(len(bounds) - 1, dtype=np.int16), np.diff(bounds))
 
 
 def random_scan(sensor: Sensor, count: int = 3000, seed: int = 0) -> Scan:

@@ -7,7 +7,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
-from conftest import random_scan
+from conftest import random_scan, ring_numbers
 from hypothesis import given, settings
 from hypothesis.extra import numpy as hnp
 
@@ -16,7 +16,6 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import (
     locate,
     project,
-    ring_numbers,
     unfold,
     unproject,
 )

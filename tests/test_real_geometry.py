@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ring_numbers
 
 from lidar_synth.formats.points import read_points
 from lidar_synth.geometry.projection import (
     locate,
     project,
-    ring_numbers,
     unfold,
     unproject,
 )

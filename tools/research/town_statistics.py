@@ -18,7 +18,7 @@ from tqdm import tqdm
 from typer import run
 
 from lidar_synth.formats import open_scans
-from lidar_synth.geometry.projection import project, ring_numbers
+from lidar_synth.geometry.projection import laser_rows, project
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
@@ -97,7 +97,7 @@ def of_directions(scan: Scan) -> dict[str, float]:
     for a in range(-180, 180, 45):
         inside = (azimuth >= a) & (azimuth < a + 45)
         figures[f"share of returns at azimuth {a} to {a + 45} degrees"] = inside.mean()
-    ring = ring_numbers(scan.points) if scan.ring is None else scan.ring
+    ring = laser_rows(scan, scan.sensor.by_beams())
     counts = np.bincount(ring, minlength=64) / (load_sensor("town").firings or 1)
     for a in range(0, 64, 16):
         name = f"returns per firing, rings {a} to {a + 15}"

@@ -1,7 +1,6 @@
 """Points to range image and back (geometry only: no networks, no files); ``batch`` does it with
 torch, on any device."""
 
-from lidar_synth.geometry.projection.rings import ring_numbers
 from lidar_synth.geometry.projection.spherical import (
     Cells,
     carry,
@@ -17,7 +16,6 @@ __all__ = [
     "laser_rows",
     "locate",
     "project",
-    "ring_numbers",
     "unfold",
     "unproject",
 ]

@@ -43,17 +43,6 @@ FRAGMENT = 0.05
 neighbouring ring."""
 
 
-def ring_numbers(points: NDArray[np.float32]) -> NDArray[np.int16]:
-    """(N,) ring of each point, 0 = the first in the file, for a scan in raw ring order or a crop of
-    one.
-
-    Args:
-        points: (N, 3) float32 metres, in the order of the file.
-    """
-    bounds = ring_bounds(points)
-    return np.repeat(np.arange(len(bounds) - 1, dtype=np.int16), np.diff(bounds))
-
-
 def ring_bounds(points: NDArray[np.float32]) -> NDArray[np.int64]:
     """(R + 1,) the first point of each ring, and N, for a scan of N points in raw ring order or a
     crop of one."""

@@ -6,7 +6,7 @@ where the lasers are closer together than the rows (the upper half of an HDL-64E
 empty where they are further apart.
 """
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,6 @@ from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
 from lidar_synth.geometry.projection.spherical import carry, cells_of, nearest_in
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
-
-Anchor = Literal["elevation", "last"]
-"""How rings are assigned to rows: "elevation" uses the nearest laser beams; "last" counts up from
-the last ring, as the public code of R2Flow does (this shifts a scan whose lower rings are cut
-off)."""
 
 
 def rows_by_elevation(
@@ -48,16 +43,13 @@ def rows_by_elevation(
     return rows
 
 
-def unfold(
-    scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation"
-) -> RangeImage:
+def unfold(scan: Scan, sensor: Sensor | None = None) -> RangeImage:
     """Unfold a scan to a range image with one row per laser; a cell shows its nearest return.
 
     Args:
         scan: N points in raw ring order, or a crop of such a scan; with ``scan.ring``, the points
             may be in any order.
         sensor: defines lasers and columns; by default the scan's own sensor.
-        anchor: how rows are assigned to rings if the scan has no ``ring``.
 
     Returns:
         An image on ``sensor.by_beams()``, whose rays have the elevations of the lasers.
@@ -78,20 +70,17 @@ def unfold(
     # the rows follow from the rings
     grid = grid_of(lasers)._replace(edges=np.empty(0, np.float32))
     cell, distance = cells_of(scan.points, grid)
-    put_in_rows(cell, laser_rows(scan, lasers, anchor), lasers.shape[1])
+    put_in_rows(cell, laser_rows(scan, lasers), lasers.shape[1])
     image, index = nearest_in(cell, distance, lasers)
     return RangeImage(image, lasers, carry(scan, index))
 
 
-def laser_rows(
-    scan: Scan, lasers: Sensor, anchor: Anchor = "elevation"
-) -> NDArray[np.int64]:
+def laser_rows(scan: Scan, lasers: Sensor) -> NDArray[np.int64]:
     """(N,) row of the laser that measured each point, 0 = highest.
 
     Args:
         scan: N points in raw ring order, or in any order with ``scan.ring``.
         lasers: a sensor with one row per laser.
-        anchor: how rows are assigned to rings if the scan has no ``ring``.
 
     Raises:
         DataError: as ``unfold``.
@@ -107,7 +96,12 @@ def laser_rows(
     bounds = ring_bounds(scan.points)
     if fault := fault_of(scan.points, bounds, lasers):
         raise _not_in_rings(scan, fault)
-    return np.repeat(_rows_of_rings(scan, bounds, lasers, anchor), np.diff(bounds))
+    sine = np.empty(len(scan), np.float32)
+    middle = np.empty(len(bounds) - 1)
+    sines_of(scan.points, sine)
+    medians(sine, bounds, middle)
+    rows = rows_by_elevation(np.arcsin(middle), lasers.laser_elevations)
+    return np.repeat(rows, np.diff(bounds))
 
 
 def _not_in_rings(scan: Scan, reason: str) -> DataError:
@@ -116,17 +110,3 @@ def _not_in_rings(scan: Scan, reason: str) -> DataError:
         "points ring by ring, as KITTI stores them",
         "Use project() for a scan in another order, or set scan.ring.",
     )
-
-
-def _rows_of_rings(
-    scan: Scan, bounds: NDArray[np.int64], lasers: Sensor, anchor: Anchor
-) -> NDArray[np.int64]:
-    """(R,) the row of each ring."""
-    count = len(bounds) - 1
-    if anchor == "last":
-        return np.arange(count) + lasers.shape[0] - count
-    sine = np.empty(len(scan), np.float32)
-    middle = np.empty(count)
-    sines_of(scan.points, sine)
-    medians(sine, bounds, middle)
-    return rows_by_elevation(np.arcsin(middle), lasers.laser_elevations)
