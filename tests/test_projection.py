@@ -369,6 +369,16 @@ def test_unfolding_with_ring_numbers_needs_no_order() -> None:
     assert np.allclose(unfold(scan[mixed]).range, image.range, rtol=3e-7)
 
 
+@pytest.mark.parametrize(
+    ("other", "kept"), [("hdl64e_semantic_kitti", True), ("os1_64", False)]
+)
+def test_rings_stay_with_their_lasers(other: str, kept: bool) -> None:
+    image = image_of(presets()["hdl64e_lasers"], 0)
+    image.channels["ring"] = np.indices(image.range.shape)[0]
+    seen = unproject(project(unproject(image), presets()[other]))
+    assert (seen.ring is not None) is kept
+
+
 def test_row_edges_of_a_beam_table_are_halfway_between_beams() -> None:
     sensor = SMALL["table"]
     beams = np.radians(sensor.elevations)

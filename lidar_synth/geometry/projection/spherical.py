@@ -6,6 +6,7 @@ that unprojecting and projecting an image again gives the same image.
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,7 +114,8 @@ def project(
     Args:
         scan: N points.
         sensor: the sensor that defines the grid; the scan's own by default.
-        channels: names of the fields that become channels; by default all that the scan has.
+        channels: names of the fields that become channels; by default all that the scan has, except
+            the ``ring`` of other lasers than those of ``sensor``.
 
     Returns:
         (H, W) range in metres, 0 = no return, with the fields of the nearest points as channels.
@@ -131,6 +133,8 @@ def project(
         >>> project(scan, load_sensor("os1_128"), channels=["label"]).range.shape
         (128, 1024)
     """
+    if sensor and channels is None and not sensor.same_lasers(scan.sensor):
+        scan = replace(scan, ring=None)
     sensor = sensor or scan.sensor
     image = np.empty(sensor.shape, np.float32)
     index = np.empty(sensor.shape, np.int32)
