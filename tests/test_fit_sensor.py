@@ -372,6 +372,15 @@ def test_the_command_writes_a_sensor_and_a_picture(
     assert run("sensor", "fit", folder, "--out", tmp_path / "mine.txt") == 2
 
 
+@pytest.mark.filterwarnings("ignore:skipped scan 000000")
+def test_scans_that_are_skipped_do_not_count(tmp_path: Path) -> None:
+    folder = write(some(3), tmp_path / "scans")
+    os.truncate(folder / "000000.bin", 1001)
+    out = tmp_path / "mine.yaml"
+    assert run("sensor", "fit", folder, "--out", out, "--on-bad", "skip") == 0
+    assert load_sensor(out).description == "fitted to 2 scans"
+
+
 @pytest.fixture
 def pandaset() -> Path:
     folder = os.environ.get("LIDAR_SYNTH_LABELLED_SCANS")

@@ -306,11 +306,14 @@ def test_the_command_line_reads_scans_as_other_commands_do(
         levels = np.round(scan.reflectance * 255)
         file = tmp_path / "logs" / f"{number:06}.bin"
         np.c_[scan.points, levels][order].astype("<f4").tofile(file)
+    (tmp_path / "logs/bad.bin").write_bytes(b"odd")
     out = tmp_path / "my.skin"
     given = ["--licence", "none", "--streets", "1", "--reflectance-max", "255"]
+    given += ["--on-bad", "skip"]
     given += ["--sensor", str(tmp_path / "sensor.yaml"), "--out", str(out)]
     result = CliRunner().invoke(app, ["skin", "fit", str(tmp_path / "logs"), *given])
     assert result.exit_code == 0 and load_skin(out).step == 1 / 255, result.output
+    assert f"learnt from {STREETS} scans" in result.output
 
 
 def test_quantiles_by_group_are_those_of_numpy() -> None:

@@ -87,7 +87,7 @@ def _read(source: Any, numbers: Iterable[int]) -> list[Scan]:
     """The scans of a source by number, without those that it skips."""
     if not isinstance(source, ScanFiles):
         return [source[i] for i in numbers]
-    return [scan for i in numbers if (scan := source.load_or_skip(i)) is not None]
+    return source.load_readable(numbers)
 
 
 def _sequence(source: Source, index: int) -> str:

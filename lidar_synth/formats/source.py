@@ -3,7 +3,7 @@ of bad scans."""
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
@@ -222,6 +222,10 @@ class ScanFiles(ABC):
             scan = self.load_or_skip(index)
             if scan is not None:
                 yield scan
+
+    def load_readable(self, indices: Iterable[int]) -> list[Scan]:
+        """The scans at some indices, without those that ``load_or_skip`` skips."""
+        return [scan for i in indices if (scan := self.load_or_skip(i)) is not None]
 
     def load_or_skip(self, index: int) -> Scan | None:
         """``load`` a scan; None, with a warning, if it cannot be read and ``on_bad`` is

@@ -62,7 +62,7 @@ def fit_from_scans(
         raise ConfigError(f"--picture {picture}", "a file that ends in .png")
     source = open_scans(path, **drop_missing(reading))
     source.skip_sensor_check()
-    chosen = [source[index] for index in spread(range(len(source)), scans)]
+    chosen = source.load_readable(spread(range(len(source)), scans))
     found = fit_sensor(chosen, name=out.stem, columns=columns)
     write_file(out, sensor_yaml(found.sensor).encode())
     if picture is not None:

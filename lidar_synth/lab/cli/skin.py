@@ -61,8 +61,7 @@ def fit_from_scans(
         raise ConfigError(f"--out {out}", "a name that ends in .skin")
     source = open_scans(scans, sensor=sensor, **drop_missing(reading))
     count = min(most, len(source))
-    read = (source.load_or_skip(i * len(source) // count) for i in range(count))
-    picked = [scan for scan in read if scan is not None]
+    picked = source.load_readable(i * len(source) // count for i in range(count))
     learnt = fit_skin(
         picked,
         licence=licence,
@@ -72,7 +71,7 @@ def fit_from_scans(
         lasers=lasers,
     )
     learnt.save(out)
-    print(f"{out}: learnt from {count} scans of {learnt.sensor.name}")
+    print(f"{out}: learnt from {len(picked)} scans of {learnt.sensor.name}")
 
 
 @skin.command("show")
