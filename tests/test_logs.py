@@ -90,6 +90,27 @@ def test_more_rings_than_the_sensor_has_rows_stay_apart() -> None:
     assert np.array_equal(rows_of_rings(scan), scan.ring)
 
 
+@pytest.mark.filterwarnings("ignore:scan a of")  # of its points
+def test_a_log_in_the_frame_of_a_vehicle_is_brought_into_the_sensors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = town_of("velodyne")[0]
+    columns = LOGS["velodyne"].columns(scan)
+    on_vehicle = replace(scan, points=scan.points + np.float32([1.2, 0, 1.8]))
+    write_log(tmp_path / "a.pcd", columns | axes(on_vehicle))
+    fitted = tmp_path / "mine.yaml"
+    assert run("sensor", "fit", tmp_path, "--out", fitted, "--json") == 0
+    place = json.loads(capsys.readouterr().out)["place of the sensor"]
+    formula = place.split("by (points - ")[1].split(") @ ")
+    offset, turn = (np.float32(json.loads(text)) for text in formula)
+    with pytest.warns(UserWarning, match="rings keep the numbers of the files"):
+        read = open_scans(tmp_path, sensor=fitted)[0]
+    assert np.array_equal(read.ring, columns["ring"])
+    there = replace(read, points=(read.points - offset) @ turn)
+    write_log(tmp_path / "a.pcd", columns | axes(there))
+    assert np.array_equal(open_scans(tmp_path, sensor=fitted)[0].ring, scan.ring)
+
+
 def test_rings_become_rows_of_the_sensor_that_the_folder_names(tmp_path: Path) -> None:
     scan = town_of("velodyne")[0]
     write_log(tmp_path / "a.pcd", LOGS["velodyne"].columns(scan))

@@ -1,6 +1,7 @@
 """MCAP files of ROS 2 as drivers record them: read scan by scan, and refused where they are
 damaged."""
 
+import json
 import struct
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from mcap_files import cloud, record, some_record
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.mcap import LARGEST, MCAP
+from lidar_synth.geometry.sensor import Sensor
 
 pytest.importorskip("mcap_ros2")
 from mcap.writer import CompressionType
@@ -74,9 +76,10 @@ def test_a_cloud_without_rings_is_read_as_its_error_says(tmp_path: Path) -> None
 @pytest.mark.filterwarnings("ignore:scan a of")  # points in a box are of no sensor
 def test_rings_become_rows_of_the_sensor_that_the_folder_names(tmp_path: Path) -> None:
     record(tmp_path / "a.mcap", [("/points", 0, cloud(0))])
-    given = open_scans(tmp_path, sensor="os1_128")[0]
-    said = '{"format": "lidar-synth-scans/1", "sensor": "os1_128"}'
-    (tmp_path / "scans.json").write_text(said)
+    sensor = Sensor("upward", 64, 1.0, 50.0, rows=8, fov_up=45.0, fov_down=25.0)
+    given = open_scans(tmp_path, sensor=sensor)[0]
+    said = {"format": "lidar-synth-scans/1", "sensor": sensor.to_dict()}
+    (tmp_path / "scans.json").write_text(json.dumps(said))
     assert np.array_equal(open_scans(tmp_path)[0].ring, given.ring)
     unknown = open_scans(tmp_path)
     unknown.skip_sensor_check()

@@ -57,6 +57,9 @@ BOXES = ".boxes.json"
 # Fields of clouds that mean something else in files of other programs.
 _OURS = ("label", "confidence", "cause")
 
+MOST_OFF = 5.0
+"""Degrees between rings and beams (median) beyond which elevations do not tell the rings' rows."""
+
 
 class Folder(ScanFiles):
     """A folder of .bin, .npy, .npz, .pcd or .ply files, one kind only, or one such file.
@@ -243,8 +246,9 @@ def rows_of_rings(scan: Scan) -> NDArray[np.int16]:
     lasers.
 
     Each ring gets a row of its own: from the highest to the lowest median elevation, those that
-    fit best. More rings than rows, as of another sensor, keep their numbers. Points that are not
-    finite do not count.
+    fit best. More rings than rows, as of another sensor, and with a warning those far from the
+    beams, as in the frame of a vehicle, keep their numbers. Points that are not finite do not
+    count.
     """
     assert scan.ring is not None
     names, number = np.unique(scan.ring, return_inverse=True)
@@ -258,8 +262,17 @@ def rows_of_rings(scan: Scan) -> NDArray[np.int16]:
     elevation = beams[found.ring] + np.radians(found.off)  # as seen from the laser
     middle = np.array([np.median(part) for part in np.split(elevation, starts[1:])])
     downward = np.argsort(-middle)
+    fitting = rows_by_elevation(middle[downward], beams)
+    if np.median(abs(middle[downward] - beams[fitting])) > np.radians(MOST_OFF):
+        warnings.warn(
+            f"the points lie far from the beams of sensor {scan.sensor.name!r}: rings keep the "
+            "numbers of the files. lidar-synth sensor fit says how to bring points in the frame of "
+            "a vehicle into the sensor's",
+            stacklevel=2,
+        )
+        return scan.ring
     rows = np.zeros(len(names), np.int16)
-    rows[there[downward]] = rows_by_elevation(middle[downward], beams)
+    rows[there[downward]] = fitting
     return rows[number]
 
 

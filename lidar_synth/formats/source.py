@@ -24,7 +24,7 @@ _TRIED = 8  # scans of which the first readable one is compared with the sensor
 _NAME_IT = (
     "Name the sensor that recorded the scans, even if it is this one: --sensor NAME|FILE.yaml "
     f'(sensor=...), or {{"format": "{FORMAT}", "sensor": "NAME"}} in {NAME} in their folder. '
-    "If no preset fits: lidar-synth sensor fit."
+    "If no preset fits, or the points are in the frame of a vehicle: lidar-synth sensor fit."
 )
 
 

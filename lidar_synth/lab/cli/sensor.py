@@ -38,7 +38,8 @@ def fit_from_scans(
     quantisation.
 
     The points may be raw or motion compensated, complete or cropped, in the frame of the sensor or
-    of the vehicle. If they lie on no beams, the fit fails (exit status 1) and writes nothing.
+    of the vehicle; then the output says how to bring them into the sensor's, in which the file is.
+    If they lie on no beams, the fit fails (exit status 1) and writes nothing.
 
     \b
     Examples:
@@ -68,8 +69,7 @@ def fit_from_scans(
     if picture is not None:
         from lidar_synth.lab.fitting.picture import fit_figure
 
-        figure = fit_figure(found)
-        write_file(picture, lambda file: figure.savefig(file, format="png"))
+        write_file(picture, lambda file: fit_figure(found).savefig(file, format="png"))
     if as_json:
         typer.echo(
             json.dumps({**_values(found), "sensor": found.sensor.to_dict()}, indent=1)
@@ -87,7 +87,14 @@ def _values(found: "SensorFit") -> dict[str, object]:
     sensor = found.sensor
     x, y, z = found.mount[:3, 3]
     elevations = sensor.elevations or ()
-    tilt = float(np.degrees(np.arccos(np.clip(found.mount[2, 2], -1, 1))))
+    tilt = np.degrees(np.arcsin(np.hypot(*found.mount[2, :2])))
+    place = f"{x:.3f}, {y:.3f}, {z:.3f} m in the frame of the points, tilted {tilt:.2f} degrees"
+    if max(abs(x), abs(y), abs(z)) > 0.3 or tilt > 1:
+        place += (
+            ". The YAML is of the sensor's own frame (x ahead, y left, z up): before points "
+            "(N, 3) are read with it, bring them there by (points - "
+            f"[{x:.4f}, {y:.4f}, {z:.4f}]) @ {found.mount[:3, :3].round(6).tolist()}"
+        )
     return {
         "beams": f"{len(elevations)}, from {elevations[0]:.2f} to {elevations[-1]:.2f} degrees",
         "looks like": found.vendor or "no sensor of the table of vendors",
@@ -96,9 +103,7 @@ def _values(found: "SensorFit") -> dict[str, object]:
             f"{found.share:.1%} within 0.05 degrees; the worst beam {found.within.min():.1%}"
         ),
         "spread of a beam": f"{np.median(found.spread):.4f} degrees (median)",
-        "place of the sensor": (
-            f"{x:.3f}, {y:.3f}, {z:.3f} m in the frame of the points, tilted {tilt:.2f} degrees"
-        ),
+        "place of the sensor": place,
         "firings per turn": f"{sensor.firings or 'not known'}",
         "azimuth offsets": f"known by {found.azimuths.known}"
         if found.azimuths.known

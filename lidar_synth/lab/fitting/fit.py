@@ -59,7 +59,8 @@ class SensorFit:
         spread: (B,) degrees, the median distance of a beam's points from it.
         within: (B,) share of a beam's points within 0.05 degrees.
         mount: (4, 4) the sensor's pose in the frame of the given points, metres; its heading is not
-            fitted.
+            fitted. ``(points - mount[:3, 3]) @ mount[:3, :3]`` are points (N, 3) in the sensor's
+            own frame, for which ``sensor`` holds.
         motion: (S, 6) velocity and turn rate that motion compensation has added to each scan: m/s
             and rad/s where scans have ``time``, otherwise per turn; zero where it is not needed.
         source: where rings come from: "ring field", "order of the points" or "elevations".
@@ -133,10 +134,7 @@ def fit_sensor(
     """
     given = [scans[i] for i in spread(range(len(scans)), SCANS)]
     returned = [np.asarray(scan.points.any(axis=1)) for scan in given]
-    scans = [
-        scan if there.all() else scan[there]
-        for scan, there in zip(given, returned, strict=True)
-    ]
+    scans = [scan[there] for scan, there in zip(given, returned, strict=True)]
     count = sum(len(scan) for scan in scans)
     if count < LEAST_POINTS:
         raise DataError(
