@@ -12,7 +12,6 @@ resumes after its last batch.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from torch.utils.data import DataLoader, Dataset
@@ -22,6 +21,7 @@ from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry.scan import Source
 from lidar_synth.mixing import Collate, MixedBatches, MixedScans, to_item
 from lidar_synth.mixing.batches import CutSteps, cut_steps
+from lidar_synth.mixing.service.batches import Places, complete
 from lidar_synth.mixing.state import after_epoch, check_state, make_state
 from lidar_synth.noise import keyed_rng
 
@@ -43,35 +43,6 @@ if lightning.__version__ in STOLEN:
         "another one",
         "pip install lightning==2.5.5, and change your passwords and keys",
     )
-
-
-@dataclass(frozen=True)
-class Pending:
-    """A synthetic sample that is still to be made, after the batch transfer: its place in the plan
-    and its number."""
-
-    epoch: int
-    position: int
-    source: int
-    number: int
-
-
-class OnDevice(Dataset[Any]):
-    """A mixture whose synthetic samples are ``Pending``: workers load the real ones only."""
-
-    def __init__(self, mixed: MixedScans) -> None:
-        self.mixed = mixed
-
-    def __len__(self) -> int:
-        return len(self.mixed)
-
-    def __getitem__(self, index: int) -> Any:
-        epoch = self.mixed.epoch_of(index)
-        plan = self.mixed.plan(epoch)
-        source, number = plan[index]
-        if source < plan.reals:
-            return self.mixed.sample(epoch, index)
-        return Pending(epoch, index, source - plan.reals, number)
 
 
 class Items(Dataset[Any]):
@@ -146,7 +117,7 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         if self._resume is not None:
             self._batches.load_state_dict(self._resume)
             self._resume = None
-        dataset: Any = OnDevice(self.train) if self.on_device else self.train
+        dataset: Any = Places(self.train) if self.on_device else self.train
         collate = Unfinished if self.on_device else self.train.collate
         return _StatefulLoader(
             dataset, batch_sampler=self._batches, collate_fn=collate, **self._workers()
@@ -178,19 +149,9 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         """Make the synthetic samples of a batch, all of one generator at once, and collate it."""
         if not isinstance(batch, Unfinished):
             return batch
-        for number, source in enumerate(self.train.synthetic):
-            wanted = [
-                i
-                for i, item in enumerate(batch)
-                if isinstance(item, Pending) and item.source == number
-            ]
-            numbers = [batch[i].number for i in wanted]
-            scans = source.scans(numbers) if numbers else []  # type: ignore[attr-defined]
-            for i, scan in zip(wanted, scans, strict=True):
-                batch[i] = self.train.finish(scan, batch[i].epoch, batch[i].position)
         device = self.trainer.strategy.root_device if self.trainer else "cpu"
         return super().transfer_batch_to_device(
-            self.train.collate(batch), device, dataloader_idx
+            complete(self.train, batch), device, dataloader_idx
         )
 
     def state_dict(self) -> dict[str, Any]:

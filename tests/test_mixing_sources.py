@@ -291,7 +291,7 @@ def batch_of(sample: Any) -> Any:
         (
             lambda: mixed().batches(2).load_state_dict({"epoch": 1}),
             ConfigError,
-            r"seed, epoch and position",
+            r"epoch and position",
         ),
         (
             lambda: (
@@ -300,7 +300,7 @@ def batch_of(sample: Any) -> Any:
                 .load_state_dict({"seed": 1, "epoch": 0, "position": 0, "plan": ""})
             ),
             ConfigError,
-            r"seed 1 for a mixture of seed 0",
+            r"a state of another mixture",
         ),
         (
             lambda: MixedScans(Scans("r", 2), Endless(("reflectance",))),

@@ -46,7 +46,7 @@ WAYS = pytest.mark.parametrize("make", [batches, stream])
             r"synthetic .*'s'.*, here .*'t'",
         ),
         (lambda: mixed(ratio=[0.5, 0.25]), r"samples before\[1\] 4, here 12"),
-        (lambda: mixed(seed=1), r"the state of seed 0 for a mixture of seed 1"),
+        (lambda: mixed(seed=1), r"seed 0, here 1"),
     ],
 )
 def test_a_state_of_another_mixture_is_refused(

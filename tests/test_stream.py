@@ -337,7 +337,7 @@ def test_invalid_options_and_states_of_a_stream_are_refused(
     stream = MixedStream(mixed(), batch_size=4, endless=False)
     with pytest.raises(ConfigError, match="5 batches done of 4"):
         stream.state_dict(5)
-    with pytest.raises(ConfigError, match="the state of seed 3"):
+    with pytest.raises(ConfigError, match="a state of another mixture"):
         stream.load_state_dict({"seed": 3, "epoch": 0, "position": 0, "plan": ""})
     next(iter(stream))
     after = stream.state_dict()

@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import Self
 
 from lidar_synth.datasets.classes import BOXED
 from lidar_synth.errors import ConfigError, DataError
@@ -173,7 +173,29 @@ class PasteObjects:
 
 
 @dataclass(frozen=True)
-class PolarMix:
+class _RealMix:
+    """A policy that draws from labelled scans."""
+
+    def bind(self: Any, real: Source | None, fields: frozenset[str]) -> Any:
+        """The policy with real scans, if it has no others.
+
+        Raises:
+            ConfigError: if they have no labels, or neither boxes nor instances for objects.
+        """
+        check_own(self.threshold, fields)
+        bound = replace(self, real=real if self.real is None else self.real)
+        policy = type(self).__name__
+        first = _first_labelled(bound.real, policy)
+        if getattr(self, "objects", 0) and first.boxes is None is first.instance:
+            raise ConfigError(
+                f"{policy} with real scans that have neither boxes nor instances",
+                "objects=0",
+            )
+        return bound
+
+
+@dataclass(frozen=True)
+class PolarMix(_RealMix):
     """``polarmix``: inserts a sector of a random real scan, and objects of it turned about the
     sensor (Xiao et al., "PolarMix", NeurIPS 2022).
 
@@ -206,23 +228,6 @@ class PolarMix:
         check_count("objects", self.objects, 0)
         check_share("threshold", self.threshold)
 
-    def bind(self, real: Source | None, fields: frozenset[str]) -> Self:
-        """The policy with real scans, if it has no others.
-
-        Raises:
-            ConfigError: if they have no labels, or neither boxes nor instances for objects.
-        """
-        check_own(self.threshold, fields)
-        bound = replace(self, real=real if self.real is None else self.real)
-        first = _first_labelled(bound.real, type(self).__name__)
-        if self.objects and first.boxes is None and first.instance is None:
-            raise ConfigError(
-                f"{type(self).__name__} with real scans that have neither boxes nor "
-                "instances",
-                "objects=0",
-            )
-        return bound
-
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         other = _draw_real(self.real, type(self).__name__, scan, rng)
         columns = scan.sensor.columns
@@ -248,7 +253,7 @@ class PolarMix:
 
 
 @dataclass(frozen=True)
-class LaserMix:
+class LaserMix(_RealMix):
     """``lasermix``: bands of elevation, alternately from the synthetic and from a random real
     scan (Kong et al., "LaserMix", CVPR 2023).
 
@@ -282,17 +287,6 @@ class LaserMix:
         for number in self.bands:
             check_count("bands", number, 2)
         check_share("threshold", self.threshold)
-
-    def bind(self, real: Source | None, fields: frozenset[str]) -> "LaserMix":
-        """The policy with real scans, if it has no others.
-
-        Raises:
-            ConfigError: if they have no labels.
-        """
-        check_own(self.threshold, fields)
-        bound = replace(self, real=real if self.real is None else self.real)
-        _first_labelled(bound.real, "LaserMix")
-        return bound
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         other = _draw_real(self.real, "LaserMix", scan, rng)

@@ -116,21 +116,16 @@ def check_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]:
     Raises:
         ConfigError: on missing or impossible values, or the state of another mixture.
     """
-    values = [state.get(key) for key in ("seed", "epoch", "position")]
+    values: list[Any] = [state.get(key) for key in ("epoch", "position")]
     if (
         not all(isinstance(value, int) and value >= 0 for value in values)
         or "plan" not in state
     ):
         raise ConfigError(
             f"state {dict(state)}",
-            "seed, epoch and position, integers of 0 or more, and the hash of the plan",
+            "epoch and position, integers of 0 or more, and the hash of the plan",
         )
-    seed, epoch, position = (int(value or 0) for value in values)
-    if seed != mixture.seed:
-        raise ConfigError(
-            f"the state of seed {seed} for a mixture of seed {mixture.seed}",
-            "the seed of the state",
-        )
+    epoch, position = values
     plan = MixingPlan(mixture, epoch)
     if state.get("plan") != plan.hash:
         differences = list(_differences(state.get("mixture"), plan.facts, ""))

@@ -6,7 +6,7 @@ uses a CUDA stream of its own. Label policy, augmentation and ``to_sample`` are 
 dataset, so that the samples are the same as with any other way of loading.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from copy import copy
@@ -75,14 +75,11 @@ class BatchMixer:
             )
         self.dataset = dataset
         self.batch_sampler = batch_sampler or dataset.batches(batch_size or 0)
-        self._sources = {
-            n: source
-            for n, source in enumerate(dataset.synthetic)
-            if isinstance(source, Generated)
-        }
-        others = _Others(dataset, self._sources)
         self._loader = DataLoader(
-            others, batch_sampler=self.batch_sampler, collate_fn=list, **options
+            Places(dataset),
+            batch_sampler=self.batch_sampler,
+            collate_fn=list,
+            **options,
         )
         self._streams: dict[torch.device, torch.cuda.Stream] = {}
 
@@ -93,40 +90,17 @@ class BatchMixer:
         with ThreadPoolExecutor(1, "lidar-synth") as thread:
             ready: Future[Any] | None = None
             for places in self._loader:
-                upcoming = thread.submit(self._batch, places)
+                upcoming = thread.submit(complete, self.dataset, places, self._stream)
                 if ready is not None:
                     yield ready.result()
                 ready = upcoming
             if ready is not None:
                 yield ready.result()
 
-    def _batch(self, places: Sequence[Place]) -> Any:
-        scans: dict[tuple[int, int], Scan] = {}
-        for number, source in self._sources.items():
-            indices = list(
-                dict.fromkeys(
-                    p.missing[1] for p in places if p.missing and p.missing[0] == number
-                )
-            )
-            if indices:
-                with self._stream(source.generator.device):
-                    made = source.scans(indices)
-                scans |= {
-                    (number, index): scan
-                    for index, scan in zip(indices, made, strict=True)
-                }
-        return self.dataset.collate(
-            [
-                self.dataset.finish(scans[p.missing], p.epoch, p.position)
-                if p.missing
-                else p.sample
-                for p in places
-            ]
-        )
-
-    def _stream(self, device: torch.device) -> AbstractContextManager[Any]:
+    def _stream(self, source: Any) -> AbstractContextManager[Any]:
         """The CUDA stream on which scans are made, so that they do not queue behind the trainer's
         work."""
+        device = source.generator.device
         if device.type != "cuda":
             return nullcontext()
         if device not in self._streams:
@@ -135,14 +109,44 @@ class BatchMixer:
         return torch.cuda.stream(self._streams[device])
 
 
-class _Others(Dataset[Place]):
+def complete(
+    dataset: MixedScans,
+    places: Sequence[Place],
+    stream: Callable[[Any], AbstractContextManager[Any]] = nullcontext,
+) -> Any:
+    """The batch of some places, whose missing scans are made, all of one generator at once.
+
+    Args:
+        dataset: the mixture.
+        places: of ``Places(dataset)``.
+        stream: the context in which a source makes its scans.
+    """
+    scans: dict[tuple[int, int], Scan] = {}
+    missing = dict.fromkeys(p.missing for p in places if p.missing)
+    for number in sorted({number for number, _ in missing}):
+        wanted = [pair for pair in missing if pair[0] == number]
+        source: Any = dataset.synthetic[number]
+        with stream(source):
+            made = source.scans([index for _, index in wanted])
+        scans |= zip(wanted, made, strict=True)
+    return dataset.collate(
+        [
+            dataset.finish(scans[p.missing], p.epoch, p.position)
+            if p.missing
+            else p.sample
+            for p in places
+        ]
+    )
+
+
+class Places(Dataset[Place]):
     """The dataset of the workers: all samples except those whose scan the main process makes."""
 
-    def __init__(self, dataset: MixedScans, missing: Collection[int]) -> None:
+    def __init__(self, dataset: MixedScans) -> None:
         # Workers get no network: one on a GPU could not be sent to them.
         sources: list[Any] = [
-            None if n in missing else source
-            for n, source in enumerate(dataset.synthetic)
+            None if isinstance(source, Generated) else source
+            for source in dataset.synthetic
         ]
         self._dataset = copy(dataset)
         self._dataset.synthetic = tuple(sources)

@@ -31,7 +31,18 @@ class Outlook(Protocol):
         ...
 
 
-class SequentialPrefetch:
+class _InTurn:
+    """Numbers that follow one another."""
+
+    _next: int
+
+    def upcoming(self, held: Container[int]) -> tuple[float, int]:
+        while self._next in held:
+            self._next += 1
+        return self._next, self._next
+
+
+class SequentialPrefetch(_InTurn):
     """Predicts 0, 1, 2, ..., or consecutive numbers from the latest request on, when no order was
     announced.
 
@@ -51,11 +62,6 @@ class SequentialPrefetch:
             )
         self._past = max(self._past, number - self._window)
         return number
-
-    def upcoming(self, held: Container[int]) -> tuple[float, int]:
-        while self._next in held:
-            self._next += 1
-        return self._next, self._next
 
     def next_use(self, number: int, served: int) -> float:
         return NEVER if served or number < self._past else number
@@ -100,7 +106,7 @@ class KnownOrder:
         return uses[0] if uses else NEVER
 
 
-class RotatingPool:
+class RotatingPool(_InTurn):
     """A pool of scans that serves all requests of an epoch; each new epoch replaces the oldest
     scans.
 
@@ -120,11 +126,6 @@ class RotatingPool:
 
     def answer(self, number: int) -> int:
         return self._first + (number - self._first) % self._size
-
-    def upcoming(self, held: Container[int]) -> tuple[float, int]:
-        while self._next in held:
-            self._next += 1
-        return self._next, self._next
 
     def next_use(self, number: int, served: int) -> float:
         return number if number >= self._first else NEVER
