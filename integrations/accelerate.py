@@ -4,6 +4,7 @@
         train, batch_sampler=train.batches(4), collate_fn=train.collate, num_workers=2
     )
     loader = prepare(accelerator, loader)
+    accelerator.register_for_checkpointing(loader)  # for save_state, or save loader.state_dict()
     for epoch in range(first, epochs):
         train.set_epoch(epoch)
         for batch in loader: ...
@@ -14,6 +15,7 @@ the epoch that was set or resumed, or else the next one, and all processes toget
 samples once.
 """
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from torch.utils.data import DataLoader
@@ -22,7 +24,7 @@ from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.mixing import MixedBatches, MixedStream
 
 try:
-    from accelerate.data_loader import prepare_data_loader
+    from accelerate.data_loader import DataLoaderShard, prepare_data_loader
 except ImportError as error:
     raise LibraryError(
         f"accelerate cannot be imported ({error})",
@@ -40,7 +42,9 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
             ``MixedStream``.
 
     Returns:
-        Accelerate's own loader, which puts batches on the accelerator's device.
+        Accelerate's own loader, which puts batches on the accelerator's device, with
+        ``state_dict()`` and ``load_state_dict(state)`` as of a ``MixedLoader``; those of the given
+        loader are the same from now on.
 
     Raises:
         ConfigError: on a loader that is prepared already, or one without ``train.batches``.
@@ -68,7 +72,7 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
             "Give the loader as it was before accelerator.prepare.",
         )
     divided.divide(accelerator.process_index, accelerator.num_processes)
-    shard = prepare_data_loader(
+    made = prepare_data_loader(
         loader,
         accelerator.device,
         num_processes=1,
@@ -76,6 +80,39 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
         put_on_device=accelerator.device_placement,
         dispatch_batches=False,
     )
-    mixed: Any = divided.scans if isinstance(divided, MixedStream) else divided.dataset
-    mixed.current.follow(shard)
+    shard = _Prepared(made, divided)
+    vars(loader).update(
+        state_dict=shard.state_dict, load_state_dict=shard.load_state_dict
+    )
     return shard
+
+
+class _Prepared(DataLoaderShard):  # type: ignore[misc]
+    """Accelerate's loader, which counts the batches that it has yielded: it fetches one ahead."""
+
+    def __init__(self, made: Any, divided: Any) -> None:
+        vars(self).update(vars(made))
+        stream = isinstance(divided, MixedStream)
+        self._divided = divided
+        self._current = (divided.scans if stream else divided.dataset).current
+        self._current.follow(self)
+        self._pass = (0, 0)  # an epoch, and number of its batches done
+
+    def __iter__(self) -> Iterator[Any]:
+        epoch = self.iteration
+        for done, batch in enumerate(super().__iter__(), 1):
+            self._pass = (epoch, done)
+            yield batch
+
+    def state_dict(self) -> dict[str, Any]:
+        """The progress after the latest batch."""
+        epoch, done = self._pass
+        state: dict[str, Any] = self._divided.state_dict(
+            done if epoch == int(self._current) else 0
+        )
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Resume from a state with the next pass; raises as ``MixedLoader.load_state_dict``."""
+        self._divided.load_state_dict(state)
+        self._pass = (0, 0)

@@ -1,9 +1,11 @@
 """Mixtures in Accelerate's loaders with two processes: the epoch that was set or resumed, each
 sample once."""
 
+import itertools
 import os
 import socket
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -153,3 +155,33 @@ def test_two_processes_see_every_sample_once_or_refuse() -> None:
         free.bind(("127.0.0.1", 0))
         port = int(free.getsockname()[1])
     mp.start_processes(run, (port,), nprocs=2, start_method="fork")
+
+
+@pytest.mark.parametrize("cut", [2, 12, 14])
+@pytest.mark.parametrize("make", [batched, streamed, MixedScans.loader])
+def test_a_prepared_loader_resumes_after_its_last_batch(
+    make: Any, cut: int, tmp_path: Path
+) -> None:
+    from accelerate import Accelerator
+
+    given = make(mixed(), 4) if make is MixedScans.loader else make(mixed(), 0)
+    saved = Accelerator(cpu=True)
+    loader = prepare(saved, given)
+    saved.register_for_checkpointing(loader)
+    passes = itertools.chain.from_iterable(loader for _ in range(2))
+    for _ in itertools.islice(passes, cut):
+        pass
+    epoch, done = divmod(cut, 12)
+    state = loader.state_dict()
+    assert (state["epoch"], state["position"]) == (epoch, done * 4)
+    assert given.state_dict() == state
+    saved.save_state(tmp_path)
+    again = Accelerator(cpu=True)
+    loader = prepare(again, make(mixed(), 4 if make is MixedScans.loader else 0))
+    again.register_for_checkpointing(loader)
+    again.load_state(tmp_path)
+    assert loader.state_dict() == state
+    rest = [int(x) for batch in loader for x in batch]
+    assert rest == planned(epoch, done * 4)
+    next(iter(loader))
+    assert loader.state_dict()["position"] == 4
