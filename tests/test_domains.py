@@ -250,6 +250,28 @@ def test_settling_takes_the_statistics_of_its_batches_alone() -> None:
         settle(network, [])
 
 
+def test_settling_leaves_the_layers_of_the_other_domain() -> None:
+    layer = ByDomain(torch.nn.BatchNorm1d(1))
+    layer.layers[1].running_mean.fill_(5.0)
+    layer.layers[1].num_batches_tracked.fill_(7)
+    layer.domain = torch.ones(4)  # of the last training batch
+    settled = settle(layer, [torch.full((4, 1), -3.0)])
+    assert [norm.running_mean.item() for norm in settled.layers] == [-3.0, 5.0]
+    assert settled.layers[1].num_batches_tracked == 7
+    assert layer.domain is not None
+
+
+def test_an_evaluation_takes_the_real_layer_unless_domains_are_set() -> None:
+    layer = ByDomain(torch.nn.BatchNorm1d(1))
+    layer.layers[1].running_mean.fill_(5.0)
+    x = torch.ones(4, 1)
+    layer.domain = torch.ones(4)
+    torch.nn.Sequential(layer).eval()
+    assert torch.equal(layer(x), layer.layers[0](x))
+    layer.domain = torch.ones(4)
+    assert torch.equal(layer(x), layer.layers[1](x))
+
+
 def test_each_domain_has_its_layer_and_its_statistics() -> None:
     layer = ByDomain(torch.nn.BatchNorm1d(2, momentum=1.0))
     x = torch.arange(12.0).reshape(6, 2)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
+from typing_extensions import Self
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.schedules import Schedule, make_schedule, share_of
@@ -45,7 +46,8 @@ def settle(
 
     Those of a training on a mixture are of real and synthetic scans together; a network that is
     used on real scans wants those of real scans, which need no labels. A training that ends on
-    real scans, as by ``mix(epochs=40)``, leaves them already.
+    real scans, as by ``mix(epochs=40)``, leaves them already. A layer that sees no batch, as
+    the synthetic one of a ``ByDomain``, keeps its own.
 
     Args:
         model: the trained network; it stays as it is.
@@ -64,13 +66,15 @@ def settle(
         >>> settled.running_mean, network.running_mean
         (tensor([3.]), tensor([0.]))
     """
-    model = deepcopy(model).train()
-    norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
-    momenta = [norm.momentum for norm in norms]
+    settled = deepcopy(model).eval().train()  # eval: ByDomain's real layer
+    norms, given = (
+        [module for module in network.modules() if isinstance(module, _BatchNorm)]
+        for network in (settled, model)
+    )
     for norm in norms:
         norm.reset_running_stats()
         norm.momentum = None  # the mean of all batches
-    run = model if forward is None else partial(forward, model)
+    run = settled if forward is None else partial(forward, settled)
     count = 0
     with torch.no_grad():
         for batch in batches:
@@ -78,9 +82,11 @@ def settle(
             count += 1
     if not count:
         raise ConfigError("no batch to settle on", "batches of real scans")
-    for norm, momentum in zip(norms, momenta, strict=True):
-        norm.momentum = momentum
-    return model.eval()
+    for norm, old in zip(norms, given, strict=True):
+        norm.momentum = old.momentum
+        if norm.num_batches_tracked == 0:
+            norm.load_state_dict(old.state_dict())
+    return settled.eval()
 
 
 class ByDomain(nn.Module):
@@ -91,7 +97,7 @@ class ByDomain(nn.Module):
 
     Attributes:
         domain: (B,) the domain of each sample of the next batch, 0 real, 1 synthetic; set it
-            before the network runs. None, as for a test, takes the real one.
+            before the network runs. None takes the real layer; ``eval()`` sets it to None.
 
     Example:
         >>> import torch
@@ -106,6 +112,12 @@ class ByDomain(nn.Module):
         super().__init__()
         self.layers = nn.ModuleList([layer, deepcopy(layer)])
         self.domain: Tensor | None = None
+
+    def train(self, mode: bool = True) -> Self:
+        """Set the mode; that of evaluation forgets the domains of the last training batch."""
+        if not mode:
+            self.domain = None
+        return super().train(mode)
 
     def forward(self, x: Tensor) -> Tensor:
         """The output (B, ...) of each sample (B, ...) by the layer of its domain.
