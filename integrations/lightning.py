@@ -12,6 +12,7 @@ resumes after its last batch.
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from torch.utils.data import DataLoader, Dataset
@@ -181,9 +182,9 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
     def _plain(self, scans: Source | None) -> Any:
         if scans is None:
             return []
-        collate = (
-            self.train.collate if isinstance(self.train.collate, Collate) else Collate()
-        )
+        given = self.train.collate
+        collate = given if isinstance(given, Collate) else Collate()
+        collate = replace(collate, unlabelled="allow")
         return DataLoader(
             Items(scans), self.batch_size, collate_fn=collate, **self._workers()
         )

@@ -78,6 +78,13 @@ def test_two_epochs_see_exactly_the_planned_scans() -> None:
     assert model.validated == 8
 
 
+def test_scans_of_validation_need_no_labels() -> None:
+    blank = [replace(scan, label=None) for scan in Scans("v", 4)]
+    mixed = MixedScans(Scans("r", REAL), Endless(), ratio=0.25, collate="padded")
+    model = fit(module.MixedData(mixed, val=blank, batch_size=2), epochs=1)
+    assert model.validated == 4
+
+
 def test_batches_that_are_overfitted_stay_the_same() -> None:
     mixed = MixedScans(Scans("r", REAL), Endless(), ratio=0.25, seed=1)
     model = fit(module.MixedData(mixed, batch_size=4), overfit_batches=2)
