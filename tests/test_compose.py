@@ -104,6 +104,18 @@ def test_a_box_that_loses_its_returns_is_no_target(scan: Scan, given: Any) -> No
         ({"fog": {"severity": ["lite", "heavy"]}}, "light"),
         ({"fog": {"severity": ["light", "lite", "heavy"]}}, "light"),
         ({"polarmix": {"widht": 90}}, "width"),
+        ({"yaw": {"limit": 270}}, "yaw: limit 270"),
+        ({"yaw": {"limit": "45"}}, "yaw: limit '45'"),
+        ({"yaw": {"limit": [45, 270]}}, "yaw: limit 270"),
+        ({"beam_drop": {"share": 3}}, "beam_drop: share 3"),
+        ({"jitter": {"spread": -1}}, "jitter: spread=-1"),
+        ({"jitter": {"spread": "1"}}, "jitter: '<' not supported"),
+        ({"scale": {"low": 2, "high": 1}}, "scale: low=2"),
+        ({"yaw": 45}, "{'yaw': 45}.*{argument: value}"),
+        ({"yaw": 0}, "{argument: value}"),
+        ({"fog": 60}, "{argument: value}"),
+        ({"yaw": "45"}, "{argument: value}"),
+        ({"scale": [0.9, 1.1]}, "{argument: value}"),
         (Fog, "name"),
         ({"fog": {}, "snow": {}}, "name"),
         (3, "name"),
@@ -112,6 +124,13 @@ def test_a_box_that_loses_its_returns_is_no_target(scan: Scan, given: Any) -> No
 def test_bad_steps_are_refused_at_once(step: object, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Compose([step])
+
+
+def test_a_single_step_needs_no_list() -> None:
+    [step] = Compose({"yaw": {"limit": 1}}).steps
+    assert (step.name, step.arguments) == ("yaw", {"limit": 1})
+    assert [s.name for s in Compose("yaw").steps] == ["yaw"]
+    assert Compose({"yaw": None}).to_dict() == {"compose": [{"yaw": {}}]}
 
 
 def test_a_mixture_takes_steps_by_name(scan: Scan) -> None:

@@ -23,6 +23,7 @@ from typing_extensions import Self
 
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.geometry.scan import Boxes, Scan, Source
+from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.labels import augment
 from lidar_synth.labels.augment import Augmentation
 from lidar_synth.labels.own import check_share
@@ -68,7 +69,9 @@ class Step:
         if self.call is None:  # all that can be drawn is valid
             lists = [v for v in self.arguments.values() if isinstance(v, list | tuple)]
             for n in range(max(map(len, lists), default=1)):
-                self._make(partial(_nth, n))
+                made = self._make(partial(_nth, n))
+                if self.name in MOVES:
+                    self._try(made)
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         if self.p < 1 and rng.random() >= self.p:
@@ -101,6 +104,16 @@ class Step:
         chance = {} if self.p == 1 else {"p": self.p}
         return {self.name: {**self.arguments, **chance}}
 
+    def _try(self, made: Augmentation) -> None:
+        """Call it once, as it checks its arguments only then."""
+        point = np.ones((1, 3), np.float32)
+        ring = np.zeros(1, np.uint16)
+        scan = Scan(point, point[:, 0], load_sensor("vlp16"), ring=ring)
+        try:
+            made(scan, np.random.default_rng(0))
+        except (ConfigError, TypeError) as error:
+            raise ConfigError(f"{self.name}: {error}") from error
+
     def _make(self, pick: Callable[[Sequence[Any]], Any]) -> Any:
         """The augmentation; ``pick`` takes one of the values that a list stands for."""
         choose("augmentation", self.name, dict.fromkeys((*MOVES, *CORRUPTIONS, *MIXES)))
@@ -131,7 +144,8 @@ class Compose:
     dropped: nothing is left of its object to detect.
 
     Args:
-        steps: augmentations, their names, or ``{name: {argument: value, "p": chance}}``.
+        steps: augmentations, their names, or ``{name: {argument: value, "p": chance}}``; a list
+            of them, or a single one.
 
     Raises:
         ConfigError: on an unknown name or argument, or an invalid value.
@@ -149,7 +163,8 @@ class Compose:
         True
     """
 
-    def __init__(self, steps: Sequence[Any]) -> None:
+    def __init__(self, steps: Any) -> None:
+        steps = steps if isinstance(steps, list | tuple) else [steps]
         self.steps = tuple(map(read_step, steps))
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
@@ -198,7 +213,7 @@ def make_augmentation(
     if isinstance(given, Mapping) and "compose" in given:
         made = Compose.from_dict(given)
     elif not callable(given) or isinstance(given, type | Corruption):
-        made = Compose(given if isinstance(given, list | tuple) else [given])
+        made = Compose(given)
     augmentation: Augmentation = made
     return made.bind(real, fields) if hasattr(made, "bind") else augmentation
 
@@ -219,8 +234,9 @@ def read_step(given: Any) -> Step:
         return Step(given.name, own)
     if isinstance(given, Mapping) and len(given) == 1:
         [(name, options)] = given.items()
-        arguments = {str(k).lower(): v for k, v in dict(options or {}).items()}
-        return Step(str(name).lower(), arguments, p=arguments.pop("p", 1.0))
+        if isinstance(options, Mapping | None):
+            arguments = {str(k).lower(): v for k, v in (options or {}).items()}
+            return Step(str(name).lower(), arguments, p=arguments.pop("p", 1.0))
     if callable(given) and not isinstance(given, type):
         function = getattr(given, "func", given)
         for name, move in MOVES.items():
