@@ -22,6 +22,7 @@ from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.mixing import MixedBatches, MixedStream
+from lidar_synth.mixing.state import take_state
 
 try:
     from accelerate.data_loader import DataLoaderShard, prepare_data_loader
@@ -81,20 +82,18 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
         dispatch_batches=False,
     )
     shard = _Prepared(made, divided)
-    vars(loader).update(
-        state_dict=shard.state_dict, load_state_dict=shard.load_state_dict
-    )
+    take_state(loader, shard)
     return shard
 
 
 class _Prepared(DataLoaderShard):  # type: ignore[misc]
     """Accelerate's loader, which counts the batches that it has yielded: it fetches one ahead."""
 
-    def __init__(self, made: Any, divided: Any) -> None:
+    def __init__(self, made: Any, divided: MixedBatches | MixedStream) -> None:
         vars(self).update(vars(made))
-        stream = isinstance(divided, MixedStream)
         self._divided = divided
-        self._current = (divided.scans if stream else divided.dataset).current
+        mixed = divided.scans if isinstance(divided, MixedStream) else divided.dataset
+        self._current = mixed.current
         self._current.follow(self)
         self._pass = (0, 0)  # an epoch, and number of its batches done
 
@@ -107,10 +106,7 @@ class _Prepared(DataLoaderShard):  # type: ignore[misc]
     def state_dict(self) -> dict[str, Any]:
         """The progress after the latest batch."""
         epoch, done = self._pass
-        state: dict[str, Any] = self._divided.state_dict(
-            done if epoch == int(self._current) else 0
-        )
-        return state
+        return self._divided.state_dict(done if epoch == int(self._current) else 0)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume from a state with the next pass; raises as ``MixedLoader.load_state_dict``."""

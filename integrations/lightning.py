@@ -23,7 +23,7 @@ from lidar_synth.geometry.scan import Source
 from lidar_synth.mixing import Collate, MixedBatches, MixedScans, to_item
 from lidar_synth.mixing.batches import CutSteps, cut_steps
 from lidar_synth.mixing.service.batches import Places, complete
-from lidar_synth.mixing.state import after_epoch, check_state, make_state
+from lidar_synth.mixing.state import after_epoch, check_state, make_state, take_state
 from lidar_synth.noise import keyed_rng
 
 try:
@@ -120,8 +120,14 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             self._resume = None
         dataset: Any = Places(self.train) if self.on_device else self.train
         collate = Unfinished if self.on_device else self.train.collate
-        return _StatefulLoader(
-            dataset, batch_sampler=self._batches, collate_fn=collate, **self._workers()
+        return take_state(
+            DataLoader(
+                dataset,
+                batch_sampler=self._batches,
+                collate_fn=collate,
+                **self._workers(),
+            ),
+            self._batches,
         )
 
     def teardown(self, stage: str) -> None:
@@ -268,18 +274,3 @@ class _Epochs:
         return cut_steps(
             0, len(batches.dataset), batches.batch_size, batches.world_size
         )
-
-
-class _StatefulLoader(DataLoader[Any]):
-    """A ``DataLoader`` with the state of its batch sampler, which Lightning saves."""
-
-    batch_sampler: Any
-
-    def state_dict(self) -> dict[str, Any]:
-        """The batch sampler's."""
-        state: dict[str, Any] = self.batch_sampler.state_dict()
-        return state
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """The batch sampler's."""
-        self.batch_sampler.load_state_dict(state)

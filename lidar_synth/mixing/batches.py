@@ -18,7 +18,7 @@ from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, CurrentEpoch, Posi
 from lidar_synth.mixing.quotas import Mixture
 from lidar_synth.mixing.state import (
     Divided,
-    after_epoch,
+    after_batches,
     check_state,
     make_state,
 )
@@ -37,9 +37,6 @@ class Epochs(Protocol):
 
     @property
     def epoch(self) -> int: ...
-
-    @property
-    def fetched(self) -> int: ...
 
     def set_epoch(self, epoch: int) -> None: ...
 
@@ -188,7 +185,7 @@ class MixedBatches(Divided, Sampler[list[int]]):
             self._warned = True
             warnings.warn(REPEATED.format(epoch), stacklevel=2)
         before, yielded = self._fetched
-        fetched = self.dataset.fetched - before
+        fetched = self.dataset.current.fetched - before
         if self.world_size > 1 and 0 < fetched < yielded * 2 / 3:
             warnings.warn(
                 SHARED_TWICE.format(yielded, self.rank, self.world_size, fetched),
@@ -223,21 +220,14 @@ class MixedBatches(Divided, Sampler[list[int]]):
         """
         steps = self._steps()
         epoch = self.dataset.epoch
+        mixture = self.dataset.mixture
         taken = self._taken[1] if self._taken[0] == epoch else 0
-        if not 0 <= (number := taken if done is None else done) <= len(steps):
-            raise ConfigError(
-                f"{number} batches done of {len(steps)}",
-                "a number of batches of this epoch",
-            )
-        if number < len(steps):
-            position = steps[number].start
-        elif done is None:
+        if done is None and taken >= len(steps):
             # Not the next epoch yet: a trainer that resumes here still has to see the end of this
             # one.
-            position = len(self.dataset)
-        else:
-            epoch, position = after_epoch(self.dataset.mixture, epoch)
-        return make_state(self.dataset.mixture, epoch, position)
+            return make_state(mixture, epoch, len(self.dataset))
+        done = taken if done is None else done
+        return make_state(mixture, *after_batches(mixture, epoch, steps, done))
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume from a state, and set the dataset to its epoch. Later epochs start at position 0.
@@ -254,7 +244,7 @@ class MixedBatches(Divided, Sampler[list[int]]):
         announced = 0
         number = 0
         yielded = 0
-        before = self.dataset.fetched
+        before = self.dataset.current.fetched
         for done, step in enumerate(steps):
             if done * steps.size >= announced:
                 rest = (

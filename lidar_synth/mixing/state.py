@@ -7,7 +7,7 @@ can name what differs.
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -100,6 +100,14 @@ def make_state(mixture: Mixture, epoch: int, position: int) -> dict[str, Any]:
     }
 
 
+def take_state(loader: Any, progress: Any) -> Any:
+    """The loader, whose state is now that of what counts its batches."""
+    vars(loader).update(
+        state_dict=progress.state_dict, load_state_dict=progress.load_state_dict
+    )
+    return loader
+
+
 def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
     """Epoch and position after an epoch: the beginning of the next, or the same epoch's end if it
     was the last."""
@@ -108,6 +116,23 @@ def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
     except ConfigError:
         return epoch, len(MixingPlan(mixture, epoch))
     return epoch + 1, 0
+
+
+def after_batches(
+    mixture: Mixture, epoch: int, steps: Sequence[range], done: int
+) -> tuple[int, int]:
+    """Epoch and position after a number of steps of an epoch.
+
+    Raises:
+        ConfigError: on more than it has.
+    """
+    if not 0 <= done <= len(steps):
+        raise ConfigError(
+            f"{done} batches done of {len(steps)}", "a number of batches of this epoch"
+        )
+    if done < len(steps):
+        return epoch, steps[done].start
+    return after_epoch(mixture, epoch)
 
 
 def check_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from lidar_synth.mixing.epochs import check_pass, share, shared_integers
 from lidar_synth.mixing.scans import MixedScans
 from lidar_synth.mixing.state import (
     Divided,
-    after_epoch,
+    after_batches,
     check_state,
     make_state,
 )
@@ -124,9 +124,9 @@ class MixedStream(Divided, IterableDataset[Any]):
             guarded: whether to refuse a change of the epoch. A later pass of a persistent worker
                 may begin only after ``iter(loader)`` returned, and would miss the change.
         """
-        worker = self._place()["worker"]
-        workers = self._place()["workers"]
-        batches = islice(self._batches(begin, position), worker, None, workers)
+        place = self._place()
+        worker = place["worker"]
+        batches = islice(self._batches(begin, position), worker, None, place["workers"])
         # First: the number of the epoch's first sample.
         epoch = begin
         first = -position
@@ -266,14 +266,7 @@ class MixedStream(Divided, IterableDataset[Any]):
         """The epoch and position after a number of batches."""
         if not self.endless:
             steps = self._steps(position, len(self.scans))
-            if not 0 <= done <= len(steps):
-                raise ConfigError(
-                    f"{done} batches done of {len(steps)}",
-                    "a number of batches of this epoch",
-                )
-            if done < len(steps):
-                return (epoch, steps[done].start)
-            return after_epoch(self.scans.mixture, epoch)
+            return after_batches(self.scans.mixture, epoch, steps, done)
         epochs, position = divmod(
             position + done * self.batch_size * self.world_size, len(self.scans)
         )

@@ -88,14 +88,15 @@ class BatchMixer:
 
     def __iter__(self) -> Iterator[Any]:
         with ThreadPoolExecutor(1, "lidar-synth") as thread:
-            ready: Future[Any] | None = None
+            ready: list[Future[Any]] = []
             for places in self._loader:
-                upcoming = thread.submit(complete, self.dataset, places, self._stream)
-                if ready is not None:
-                    yield ready.result()
-                ready = upcoming
-            if ready is not None:
-                yield ready.result()
+                ready.append(
+                    thread.submit(complete, self.dataset, places, self._stream)
+                )
+                if len(ready) == 2:
+                    yield ready.pop(0).result()
+            for last in ready:
+                yield last.result()
 
     def _stream(self, source: Any) -> AbstractContextManager[Any]:
         """The CUDA stream on which scans are made, so that they do not queue behind the trainer's
@@ -158,9 +159,7 @@ class Places(Dataset[Place]):
         epoch = self._dataset.epoch_of(position)
         plan = self._dataset.plan(epoch)
         source, index = plan[position]
-        if (
-            source >= plan.reals
-            and self._dataset.synthetic[source - plan.reals] is None
-        ):
-            return Place(epoch, position, (source - plan.reals, index))
+        number = source - plan.reals
+        if number >= 0 and self._dataset.synthetic[number] is None:
+            return Place(epoch, position, (number, index))
         return Place(epoch, position, sample=self._dataset.sample(epoch, position))
