@@ -69,9 +69,7 @@ class Step:
         if self.call is None:  # all that can be drawn is valid
             lists = [v for v in self.arguments.values() if isinstance(v, list | tuple)]
             for n in range(max(map(len, lists), default=1)):
-                made = self._make(partial(_nth, n))
-                if self.name in MOVES:
-                    self._try(made)
+                self._make(partial(_nth, n), check=True)
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         if self.p < 1 and rng.random() >= self.p:
@@ -104,25 +102,16 @@ class Step:
         chance = {} if self.p == 1 else {"p": self.p}
         return {self.name: {**self.arguments, **chance}}
 
-    def _try(self, made: Augmentation) -> None:
-        """Call it once, as it checks its arguments only then."""
-        point = np.ones((1, 3), np.float32)
-        ring = np.zeros(1, np.uint16)
-        scan = Scan(point, point[:, 0], load_sensor("vlp16"), ring=ring)
-        try:
-            made(scan, np.random.default_rng(0))
-        except (ConfigError, TypeError) as error:
-            raise ConfigError(f"{self.name}: {error}") from error
-
-    def _make(self, pick: Callable[[Sequence[Any]], Any]) -> Any:
-        """The augmentation; ``pick`` takes one of the values that a list stands for."""
+    def _make(self, pick: Callable[[Sequence[Any]], Any], check: bool = False) -> Any:
+        """The augmentation; ``pick`` takes one of the values that a list stands for. One of
+        ``MOVES`` checks its arguments when it is called."""
         choose("augmentation", self.name, dict.fromkeys((*MOVES, *CORRUPTIONS, *MIXES)))
         if self.name in MIXES:
             return read_policy({self.name: self.arguments})
-        arguments = dict(self.arguments)
-        for key, value in arguments.items():
-            if isinstance(value, list | tuple):
-                arguments[key] = pick(_check_choice(key, value))
+        arguments = {
+            k: pick(_check_choice(k, v)) if isinstance(v, list | tuple) else v
+            for k, v in self.arguments.items()
+        }
         kind = CORRUPTIONS.get(self.name)
         make: Any = MOVES.get(self.name, kind)
         if kind is not None and "severity" in arguments:
@@ -130,8 +119,18 @@ class Step:
         try:
             if kind:
                 return make(**arguments)
-            signature(make).bind(None, None, **arguments)
+            if check:
+                point = np.ones((1, 3), np.float32)
+                scan = Scan(
+                    point,
+                    point[:, 0],
+                    load_sensor("vlp16"),
+                    ring=np.zeros(1, np.uint16),
+                )
+                make(scan, np.random.default_rng(0), **arguments)
             return partial(make, **arguments)
+        except ConfigError as error:
+            raise ConfigError(f"{self.name}: {error}") from error
         except TypeError as error:
             known = [k for k in signature(make).parameters if k not in ("scan", "rng")]
             raise ConfigError(f"{self.name}: {error}", f"arguments {known}") from error
