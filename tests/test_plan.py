@@ -480,6 +480,11 @@ def test_the_remaining_samples_do_not_depend_on_the_number_of_ranks() -> None:
         (lambda: mixture(ratio=[]), ConfigError, r"a ratio from epoch 0 on"),
         (lambda: mixture(ratio={1: 0.5}), ConfigError, r"a ratio from epoch 0 on"),
         (
+            lambda: Linear(0.5, 0.1, epochs=20.0),  # type: ignore[arg-type]
+            ConfigError,
+            "epochs=20.0; expected an integer",
+        ),
+        (
             lambda: mixture(ratio=Linear(0, 0.5, 1)),
             ConfigError,
             r"over 1 epochs; expected at least 2",

@@ -82,6 +82,7 @@ class Linear:
     epochs: int
 
     def __post_init__(self) -> None:
+        to_integer(self.epochs, "epochs")
         _checked(self.first, 0)
         _checked(self.last, self.epochs - 1)
         if self.epochs < 2:
