@@ -259,7 +259,9 @@ def test_invalid_options_and_requests_are_refused(
     path: Path, bank: RollingBank, tmp_path: Path
 ) -> None:
     refusals: list[tuple[dict[str, Any], str]] = [
-        ({"slots": 0}, "slots=0"),
+        ({"slots": 0}, "slots 0"),
+        ({"slots": "4"}, "slots .4."),
+        ({"devise": "cpu"}, "option .devise.*device"),
         ({"timeout": 0}, "timeout=0"),
         ({"seed": -1}, "seed -1"),
         ({"starved": "skip"}, r"starved='skip'; expected one of \('wait', 'reuse'\)"),

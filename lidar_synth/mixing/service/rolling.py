@@ -12,6 +12,7 @@ distributed training every rank makes its own bank, on its own device::
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any, get_args
 
@@ -19,11 +20,12 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from lidar_synth.bank.encoding import Encoding
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.checkpoint import read_header
-from lidar_synth.generate.loading import find_model
+from lidar_synth.generate.loading import find_model, load_generator
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
+from lidar_synth.labels.own import check_count
 from lidar_synth.mixing.service.client import Client
 from lidar_synth.mixing.service.ledger import COUNTERS, Starved
 from lidar_synth.mixing.service.process import (
@@ -104,6 +106,8 @@ class RollingBank:
         **options: Any,
     ) -> None:
         _check(slots, seed, starved, refresh, timeout)
+        for name in options:
+            choose("option", name, signature(load_generator).parameters)
         path = find_model(model)
         header, checksum = read_header(path)
         if header.conditioning:
@@ -208,11 +212,9 @@ class RollingBank:
 def _check(
     slots: int, seed: int, starved: str, refresh: float | None, timeout: float
 ) -> None:
-    if slots < 1 or timeout <= 0:
-        raise ConfigError(
-            f"slots={slots}, timeout={timeout}",
-            "at least 1 slot, and more than 0 seconds",
-        )
+    check_count("slots", slots, 1)
+    if timeout <= 0:
+        raise ConfigError(f"timeout={timeout}", "more than 0 seconds")
     if not 0 <= seed < 2**64:
         raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
     if starved not in get_args(Starved):
