@@ -66,7 +66,6 @@ def check_alike(
     real: Sequence[Any],
     synthetic: Sequence[Synthetic],
     finish: Callable[[int, Scan, np.random.Generator], Any],
-    weighs: bool = False,
 ) -> None:
     """Compare a trainer's first sample with one synthetic sample of each source, then what several
     samples mean.
@@ -84,8 +83,6 @@ def check_alike(
         real: the trainer's datasets; the first sample of the first one is used.
         synthetic: the sources.
         finish: ``(source, scan, rng) -> sample``, what the mixture does to a scan of a source.
-        weighs: whether samples have weights in the loss, which only a dict with ``loss_weight``
-            gets.
 
     Raises:
         ConfigError: if keys, types, dtypes, ranks or the value for "ignore" differ, or units, axes,
@@ -116,12 +113,6 @@ def check_alike(
                     "the same keys, types, dtypes and ranks, and one value for ignored labels",
                     "Change to_sample, or pass compare=False if the collate function expects "
                     "them to differ.",
-                )
-            if weighs and not (isinstance(sample, dict) and "loss_weight" in sample):
-                raise ConfigError(
-                    "loss_weight for samples without the key loss_weight",
-                    "dicts with it, in which the weight of the plan is written",
-                    "If you multiply by train.loss_weight(i), pass compare=False.",
                 )
             if _tables(expected) and not _is_on_demand(source):
                 _compare_more(dataset, expected, source, make)

@@ -92,7 +92,8 @@ class MixedScans(Dataset[Any]):
             bit for bit.
         to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py).
             The scan is a copy, which it and the trainer may change in place. Into a dict with the
-            key ``loss_weight`` the weight of the plan is written.
+            key ``loss_weight`` the weight of the plan is written; others are refused if a weight
+            is not 1.
         collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"``
             (collate.py), or your own function.
         unlabelled: ``"error"`` refuses a batch without any valid label; ``"allow"`` returns it,
@@ -108,8 +109,9 @@ class MixedScans(Dataset[Any]):
             transfer)`` turns those into scans of another sensor.
         real_as_is: whether real samples are returned unchanged, because they are not ``Scan`` but
             already have the trainer's form; see ``wrap``.
-        compare: with ``real_as_is``, whether to compare the first real sample with a synthetic one
-            at construction; see ``check_alike``.
+        compare: whether to refuse weights that samples have no key for, and with ``real_as_is`` to
+            compare the first real sample with a synthetic one at construction; see
+            ``check_alike``.
 
     Attributes:
         collate: the ``collate_fn``.
@@ -221,10 +223,10 @@ class MixedScans(Dataset[Any]):
         self._untold = False
         self.set_epoch(0)
         self._untold = self._take_earlier()
+        weighs = self.synthetic_weight != make_weight(1)
+        self._weighs = compare and (weighs or set(self._loss_weights) != {1})
         if real_as_is and compare:
-            weighs = self.synthetic_weight != make_weight(1)
-            weighs |= any(weight != 1 for weight in self._loss_weights)
-            check_alike(self.real, self.synthetic, self._maker.synthetic, weighs)
+            check_alike(self.real, self.synthetic, self._maker.synthetic)
 
     def _take_earlier(self) -> bool:
         """Take the pass of the latest mixture with the same plan, if there is one."""
@@ -322,11 +324,6 @@ class MixedScans(Dataset[Any]):
     def epoch(self) -> int:
         """The epoch that indexing refers to."""
         return int(self.current)
-
-    @property
-    def fetched(self) -> int:
-        """Number of samples of ``batches`` that this process and its workers have fetched."""
-        return self.current.fetched
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, before a ``DataLoader`` begins to iterate; all its workers see it,
@@ -462,6 +459,12 @@ class MixedScans(Dataset[Any]):
         """The sample, with its weight if it is a plain item or a dict with the item's values."""
         if isinstance(sample, dict) and "loss_weight" in sample:
             sample["loss_weight"] = self._weight_of(plan, position)
+        elif self._weighs:
+            raise ConfigError(
+                "loss_weight for samples without the key loss_weight",
+                "dicts with it, in which the weight of the plan is written",
+                "If you multiply by train.loss_weight(i), pass compare=False.",
+            )
         return sample
 
     def epoch_of(self, index: int) -> int:
