@@ -1,10 +1,13 @@
 """What would harm a training without an error is logged once."""
 
+import ast
+import itertools
 import logging
 import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -16,7 +19,7 @@ from lidar_synth import mix
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, KITTIObject, open_scans
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.mixing import MixedScans
+from lidar_synth.mixing import MixedScans, notices
 
 
 class Dense(Scans):
@@ -49,6 +52,7 @@ def logged(train: MixedScans, caplog: pytest.LogCaptureFixture) -> list[str]:
 def test_another_density_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     [message] = logged(MixedScans(Dense(12), Endless(), 0.5), caplog)
     assert "a real scan has" in message and "columns=" in message
+    assert "in_view(scan, real.calibration(0))" in message
 
 
 @pytest.mark.parametrize("collate", ["offsets", "range"])
@@ -212,3 +216,35 @@ def test_a_sampler_made_anew_for_each_epoch_does_not_hide_a_repetition() -> None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run_epoch()
+
+
+def test_a_message_is_not_repeated_by_the_workers_of_the_next_epoch(
+    tmp_path: Path,
+) -> None:
+    loader = MixedScans(Dense(12), Endless(), 0.5).loader(4, 2)
+    handler = logging.FileHandler(tmp_path / "log.txt")
+    logging.getLogger("lidar_synth").addHandler(handler)
+    try:
+        for batch in itertools.chain(loader, loader, loader):
+            assert len(batch["id"])
+    finally:
+        logging.getLogger("lidar_synth").removeHandler(handler)
+    assert (tmp_path / "log.txt").read_text().count("a real scan has") == 1
+
+
+def test_messages_have_bits_of_their_own() -> None:
+    calls = [
+        node.args[0]
+        for node in ast.walk(ast.parse(Path(notices.__file__).read_text()))
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "attr", "") in ("_warn", "_is_new")
+    ]
+    texts = [c.value for c in calls if isinstance(c, ast.Constant)]
+    bits = {crc32(str(text).encode()) % 63 for text in texts}
+    assert len(bits) == len(texts) > 8
+
+
+def test_an_augmentation_that_returns_no_scan_is_refused() -> None:
+    train = MixedScans([street(0)], [street(9)], 0.5, augment=lambda scan, rng: None)
+    with pytest.raises(ConfigError, match="augment= returned NoneType.*a Scan"):
+        list(train)

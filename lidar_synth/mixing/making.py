@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import (
     POINT_FIELDS,
     REAL,
@@ -67,9 +68,18 @@ class SampleMaker:
         # Pasted objects with "same" are for a segmenter.
         boxed = boxes or getattr(policy, "clear", "same") != "same"
         self._notices = Notices(images, boxes, boxed)
-        self._without_unboxed = _make_handling(unboxed)
+        if isinstance(unboxed, str):
+            from lidar_synth.labels.edit.unboxed import make_handling  # loads networks
+
+            unboxed = make_handling(unboxed)
+        self._without_unboxed = unboxed
         common = frozenset({*POINT_FIELDS, "boxes"}).intersection(*fields)
-        self._augment = _make_augment(augment, scans, common)
+        self._augment: LabelPolicy | None = None
+        if augment is not None:
+            # It loads the corruptions.
+            from lidar_synth.labels.compose import make_augmentation
+
+            self._augment = make_augmentation(augment, scans, common)
         self._augment_real = augment_real
         self._to_sample = to_sample
 
@@ -102,6 +112,8 @@ class SampleMaker:
         if self._augment is None:
             return scan
         changed = self._augment(scan, rng)
+        if not isinstance(changed, Scan):
+            raise ConfigError(f"augment= returned {type(changed).__name__}", "a Scan")
         if scan.boxes is not None and changed.boxes is None:
             self._notices.lost_boxes(scan)
         return changed
@@ -115,21 +127,3 @@ def make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer |
     from lidar_synth.geometry.transfer import Transfer
 
     return given if isinstance(given, Transfer) else Transfer(load_sensor(given))
-
-
-def _make_augment(given: Any, scans: Any, fields: frozenset[str]) -> LabelPolicy | None:
-    """The augmentation of scans that all have ``fields``; None without one."""
-    if given is None:
-        return None
-    # It loads the corruptions.
-    from lidar_synth.labels.compose import make_augmentation
-
-    return make_augmentation(given, scans, fields)
-
-
-def _make_handling(given: str | Callable[[Scan], Scan]) -> Callable[[Scan], Scan]:
-    if not isinstance(given, str):
-        return given
-    from lidar_synth.labels.edit.unboxed import make_handling  # loads networks
-
-    return make_handling(given)

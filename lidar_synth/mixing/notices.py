@@ -6,6 +6,7 @@ tell real from synthetic, a bank used very often.
 
 import logging
 from statistics import median
+from zlib import crc32
 
 import numpy as np
 from torch.utils.data import get_worker_info
@@ -13,6 +14,7 @@ from torch.utils.data import get_worker_info
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.mixing.epochs import shared_integers
 from lidar_synth.mixing.meaning import OTHER_SIZE
 from lidar_synth.mixing.plan import MixingPlan
 
@@ -55,10 +57,10 @@ class Notices:
         self, images: bool = False, boxes: bool = False, boxed: bool = False
     ) -> None:
         self._real_boxes = boxes  # whether real scans have boxes, or should
-        self._told: set[str] = set()
+        # By bits, for all processes: what has been told, so that it is not in every epoch.
+        self._told = shared_integers(0)
         self._names: set[str] = set()  # of all boxes
         self._boxed = boxed
-        self._measured = False
         # a real scan without labels; "" if that is no matter
         self._unlabelled: str | None = "" if boxes else None
         self._labelled = False  # whether a synthetic scan had labels
@@ -121,17 +123,27 @@ class Notices:
             if max(ours, theirs) > OTHER_SIZE * min(ours, theirs):
                 self._warn(
                     "a real scan has %d points, a synthetic one %d, on the same nominal grid: the "
-                    "density tells them apart. Give load_generator columns= of that density, "
-                    "as_sensor= a sensor of it, or use collate='range'.",
+                    "density tells them apart, or the view. Give load_generator columns= of that "
+                    "density, as_sensor= a sensor of it, or use collate='range'. If real ones are "
+                    "cropped to a camera's view (with_boxes()), crop synthetic ones too: "
+                    "lidar_synth.formats.calibration.in_view(scan, real.calibration(0)).",
                     theirs,
                     ours,
                 )
 
     def _warn(self, message: str, *values: object) -> None:
         """Log a warning, unless it has been logged."""
-        if message not in self._told and _is_first():
+        if self._is_new(message):
             log.warning(message, *values)
-        self._told.add(message)
+
+    def _is_new(self, what: str) -> bool:
+        """Whether this process is the one that tells it, and has not yet."""
+        worker = get_worker_info()
+        if worker and worker.id:
+            return False
+        told = int(self._told)
+        self._told |= 1 << crc32(what.encode()) % 63
+        return int(self._told) != told
 
     def lost_boxes(self, scan: Scan) -> None:
         """Report that the augmentation has removed the boxes of a scan.
@@ -167,9 +179,8 @@ class Notices:
                 "their objects are background. For a detector, use labels='paste', or "
                 "labels='boxes' if the scans have boxes."
             )
-        if scan.boxes is None or self._measured:
+        if scan.boxes is None or not self._is_new("measured"):
             return
-        self._measured = True
         from lidar_synth.labels.edit import measure  # loads networks
 
         found = measure([given])
@@ -180,8 +191,3 @@ class Notices:
                 given.id,
                 found,
             )
-
-
-def _is_first() -> bool:
-    worker = get_worker_info()
-    return not (worker and worker.id)
