@@ -479,9 +479,8 @@ class MixedEpochs:
     """A map-style dataset of a trainer's real samples and a bank's scans, in the order of a plan.
 
     The order is already shuffled; a sampler that shuffles again does no harm. ``set_epoch`` reaches
-    the workers of a ``DataLoader``, persistent ones included. The length may differ by one between
-    epochs. A damaged plan, or one of another bank or number of real samples, raises
-    ``ReaderError``.
+    the workers of a ``DataLoader``, persistent ones included. A damaged plan, or one of another
+    bank or number of real samples, raises ``ReaderError``.
 
     Args:
         plan: file of ``python -m lidar_synth.integrations.plan``; bank: the bank with which it was

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
-from typing_extensions import Self
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.schedules import Schedule, make_schedule, share_of
@@ -113,7 +112,7 @@ class ByDomain(nn.Module):
         self.layers = nn.ModuleList([layer, deepcopy(layer)])
         self.domain: Tensor | None = None
 
-    def train(self, mode: bool = True) -> Self:
+    def train(self, mode: bool = True) -> Any:
         """Set the mode; that of evaluation forgets the domains of the last training batch."""
         if not mode:
             self.domain = None
