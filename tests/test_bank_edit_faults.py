@@ -99,6 +99,18 @@ def test_a_file_of_the_user_is_not_replaced(bank: Bank, tmp_path: Path) -> None:
     assert contents(tmp_path / "out") == {"README.md": b"mine"}
 
 
+def test_a_refused_split_leaves_no_claim(bank: Bank, tmp_path: Path) -> None:
+    train, val = tmp_path / "train", tmp_path / "val"
+    val.mkdir()
+    (val / "README.md").write_text("mine")
+    with pytest.raises(ConfigError, match="holds a README.md"):
+        split(bank, {train: 0.5, val: 0.5}, progress=False)
+    assert contents(train) == {}
+    (val / "README.md").unlink()
+    parts = split(bank, {train: 0.75, val: 0.25}, progress=False)
+    assert parts[train].scans == 6
+
+
 @pytest.mark.skipif(os.name == "nt", reason="files are not locked on Windows")
 def test_two_calls_do_not_write_one_folder(bank: Bank, tmp_path: Path) -> None:
     out = tmp_path / "out"

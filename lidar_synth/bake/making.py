@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.bake.remote import refuse_others
-from lidar_synth.files.claims import claim, hold_writing
+from lidar_synth.files.claims import hold_claim
 
 NOTE = ".made.json"
 """File in the bank's folder with the settings of the call that makes it; a run holds a lock on
@@ -18,8 +18,8 @@ it."""
 def claim_bank(out: Path, settings: dict[str, Any]) -> Iterator[None]:
     """Claim a folder for a new bank, and keep other processes out of it until the block ends.
 
-    The claim stays, so that the same call resumes after a kill. Temporary files of killed calls are
-    removed.
+    The claim stays, so that the same call resumes after a kill; that of a call that wrote nothing
+    is taken back. Temporary files of killed calls are removed.
 
     Args:
         out: the new bank's folder.
@@ -31,6 +31,5 @@ def claim_bank(out: Path, settings: dict[str, Any]) -> Iterator[None]:
     """
     if not (out / NOTE).is_file():
         refuse_others(out)
-    claim(out / NOTE, settings)
-    with hold_writing(out / NOTE):
+    with hold_claim(out / NOTE, settings):
         yield
