@@ -339,7 +339,7 @@ def test_a_wrong_object_is_named_and_repaired(
     spoil, message = DAMAGE[kind]
     content = spoil(expected["shard-00001.h5"])
     if content is None:
-        open_folder(url).remove(["shard-00001.h5"])
+        RemoteFolder(url).remove(["shard-00001.h5"])
     else:
         put(url, "shard-00001.h5", content)
     put(url, "README.md", b"edited")
@@ -357,7 +357,7 @@ def test_a_wrong_object_is_named_and_repaired(
 def test_a_lost_index_is_rebuilt(model: Path, expected: dict[str, bytes]) -> None:
     url = empty_memory()
     bake(plan_at(url, model), progress=False)
-    open_folder(url).remove([INDEX, "shard-00002.h5"])
+    RemoteFolder(url).remove([INDEX, "shard-00002.h5"])
     done = repair(url, str(model), progress=False)
     assert done[INDEX] == "rebuilt from the shards"
     assert done["shard-00002.h5"] == "regenerated"
@@ -380,7 +380,7 @@ def test_a_missing_shard_of_a_finished_bank_is_made_by_a_bake(
 ) -> None:
     plan = plan_at(empty_memory(), model)
     bake(plan, progress=False)
-    open_folder(plan.out).remove(["shard-00001.h5"])
+    RemoteFolder(str(plan.out)).remove(["shard-00001.h5"])
     bake(plan, progress=False)
     assert files_at(str(plan.out)) == expected
 

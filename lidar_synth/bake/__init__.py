@@ -1,9 +1,9 @@
 """Baking: writing banks of generated scans, on one machine or many.
 
 ``options`` holds the settings and ``job`` the plan; ``shard`` writes one shard, whichever engine
-calls it; ``run`` writes a complete bank with one of the engines (``local``, ``processes``,
-``ray_actors``, ``slurm``, ``torchrun``). ``verify``, ``repair`` and ``edit`` maintain existing
-banks.
+calls it; ``run`` writes a complete bank, in this process or with one of the other engines
+(``processes``, ``ray_actors``, ``slurm``, ``torchrun``). ``verify``, ``repair`` and ``edit``
+maintain existing banks.
 
 Each name is imported when it is first used, so that the command line can read ``BakeJob`` without
 importing torch.

@@ -69,10 +69,7 @@ def _shard(
     entry = bank.index.shards[number]
     path = out / entry.file
     if not path.is_file() or next(check_scans(path, facts, entry), None) is not None:
-        shard = bank.shard(number)
-        names = [
-            name for p in range(entry.scans) if (name := shard.condition(p)) is not None
-        ]
+        names = bank.shard(number).conditions(range(entry.scans))
         folder = LocalFolder(out)
         with folder.making(entry.file) as part:
             with ShardWriter(part, facts, entry, conditions=names) as writer:

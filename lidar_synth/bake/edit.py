@@ -234,7 +234,7 @@ def _copy_part(
 
 def _copy_scans(shard: ShardReader, positions: range, entry: Entry, path: Path) -> None:
     """Write scans of a shard to a new file, without decompressing them."""
-    names = [name for p in positions if (name := shard.condition(p)) is not None]
+    names = shard.conditions(positions)
     with ShardWriter(path, shard.facts, entry, conditions=names) as writer:
         for position in positions:
             writer.append_chunks(*shard.chunks(position))

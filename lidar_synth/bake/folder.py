@@ -45,7 +45,7 @@ def prepare(plan: BakePlan) -> BakePlan:
         ConfigError: as ``check_settings``.
         FileError: if it cannot be written.
     """
-    if not _is_claimed(plan.out):
+    if not is_claimed(plan.out):
         refuse_others(plan.out)
         content = json.dumps(plan.settings, indent=1).encode()
         # Another process may write it at the same time.
@@ -68,7 +68,7 @@ def check_settings(plan: BakePlan) -> BakePlan:
             difference; or files that the bake would replace.
         DataError, FileError: if its settings are damaged or cannot be read.
     """
-    if not _is_claimed(plan.out):
+    if not is_claimed(plan.out):
         refuse_others(plan.out)
         return plan
     text = open_folder(plan.out).read(SETTINGS).decode(errors="replace")
@@ -80,7 +80,8 @@ def check_settings(plan: BakePlan) -> BakePlan:
     return plan
 
 
-def _is_claimed(root: str | Path) -> bool:
+def is_claimed(root: str | Path) -> bool:
+    """Whether a bake has claimed a folder or a URL."""
     if isinstance(root, str):
         return SETTINGS in open_folder(root).sizes()
     return (root / SETTINGS).is_file()
@@ -137,15 +138,15 @@ def read_record(plan: BakePlan, number: int) -> Entry | None:
     """The recorded size and hash of a shard, from its own record or from the index."""
     wanted = plan.shards[number]
     assert isinstance(plan.out, Path)
+    found: list[Entry | None] = []
     with suppress(FileError, ValueError, TypeError):
-        entry = Entry(**json.loads(read_file(_note(plan.out, wanted))))
-        if replace(entry, bytes=0, sha256="") == wanted:
-            return entry
-    index = _index(plan.out)
-    there = None if index is None else index.by_file.get(wanted.file)
-    if there is not None and replace(there, bytes=0, sha256="") == wanted:
-        return there
-    return None
+        found.append(Entry(**json.loads(read_file(_note(plan.out, wanted)))))
+    # afterwards: notes are removed when there is an index
+    if index := _index(plan.out):
+        found.append(index.by_file.get(wanted.file))
+    return next(
+        (e for e in found if e and replace(e, bytes=0, sha256="") == wanted), None
+    )
 
 
 def find_finished(plan: BakePlan, number: int) -> Entry | None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bank import INDEX, Entry
 from lidar_synth.bank.card import CARD, CROISSANT
-from lidar_synth.bank.folder import open_folder
+from lidar_synth.bank.folder import RemoteFolder, open_folder
 from lidar_synth.bank.reader import read_index
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.writer import NOTES
@@ -53,7 +53,7 @@ def list_finished(plan: BakePlan, url: str) -> dict[str, Entry]:
 
 def publish(plan: BakePlan, url: str, number: int, part: Path) -> Entry:
     """Upload a shard and record it, unless another bake has; raises as ``folder.publish``."""
-    folder = open_folder(url)
+    folder = RemoteFolder(url)
     entry = plan.shards[number]
     sizes = folder.sizes()
     there = _finished(plan, url, sizes).get(entry.file)
@@ -68,7 +68,7 @@ def publish(plan: BakePlan, url: str, number: int, part: Path) -> Entry:
 
 def remove_records(url: str) -> None:
     """Remove the records of a complete bank."""
-    folder = open_folder(url)
+    folder = RemoteFolder(url)
     folder.remove([name for name in folder.sizes() if _shard_of(name)])
 
 

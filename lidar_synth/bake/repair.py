@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import write_bank_files
+from lidar_synth.bake.folder import is_claimed, write_bank_files
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.making import NOTE
 from lidar_synth.bake.options import BakeJob
@@ -95,14 +95,13 @@ def _mend(
         done[part.name] = "removed: a killed repair left it"
     try:
         index = read_index(place)
-        baked = SETTINGS in index.files or _holds_settings(folder)
+        baked = SETTINGS in index.files or is_claimed(place)
     except (DataError, FileError) as error:
         index = _index_from_shards(place, folder, error)
         baked = True
         done[INDEX] = "rebuilt from the shards"
     done |= {
-        problem.file: "rewritten from the index"
-        for problem in check_side_files(folder, index)
+        file: "rewritten from the index" for file, _ in check_side_files(folder, index)
     }
     shards = list(index.shards)
     repairs = list(index.repairs)
@@ -144,15 +143,6 @@ def _regenerate(
     return new
 
 
-def _holds_settings(folder: BankFolder) -> bool:
-    """Whether a bake filled the folder."""
-    try:
-        folder.read(SETTINGS)
-    except FileError:
-        return False
-    return True
-
-
 def _index_from_shards(
     root: str | Path, folder: BankFolder, damage: Exception
 ) -> Index:
@@ -176,7 +166,7 @@ def _index_from_shards(
             "a copy of the index",
         ) from damage
     absent = [entry.file for entry in shards if entry.file not in sizes]
-    if absent and not _holds_settings(folder):
+    if absent and not is_claimed(root):
         # The part of a split, too, has the first shards of a bake.
         raise DataError(
             f"{damage}, and {absent[0]} is not there, nor {SETTINGS}, which a bake leaves",

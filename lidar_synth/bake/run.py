@@ -14,11 +14,10 @@ from tqdm import tqdm
 
 from lidar_synth.bake.folder import at_work, find_missing, finish, prepare, release
 from lidar_synth.bake.job import BakePlan
-from lidar_synth.bake.local import bake_local
 from lidar_synth.bake.processes import bake_in_processes
 from lidar_synth.bake.ray_actors import bake_on_ray
 from lidar_synth.bake.resources import Resources
-from lidar_synth.bake.shard import Progress
+from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.bake.slurm import bake_on_slurm
 from lidar_synth.bake.torchrun import take_part
 from lidar_synth.bank import Index
@@ -26,6 +25,15 @@ from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.devices import check_device
 
 Engine = Callable[[BakePlan, Sequence[int], Resources, Progress], None]
+
+
+def bake_local(
+    plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress
+) -> None:
+    """Write the shards one after the other, in this process."""
+    for number in numbers:
+        bake_shard(plan, number, progress)
+
 
 ENGINES: dict[str, Engine] = {
     "local": bake_local,

@@ -2,8 +2,8 @@
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -34,8 +34,7 @@ SIDE_FILES = CARD, CROISSANT, SETTINGS
 _CLOSE = 2e-3  # highest relative difference of two ranges that agree
 
 
-@dataclass(frozen=True)
-class Problem:
+class Problem(NamedTuple):
     """A problem of a bank.
 
     Args:
@@ -65,55 +64,52 @@ def verify(root: str | Path, progress: bool = True) -> list[Problem]:
     """
     folder = open_folder(root)
     index = read_index(bank_root(root))
-    problems = []
+    problems: list[Problem] = []
     total = sum(entry.scans for entry in index.shards)
     with tqdm(total=total, desc="verify", unit="scan", disable=not progress) as bar:
         for entry in index.shards:
-            problems += [
-                Problem(entry.file, what)
-                for what in check_shard(folder, index.sources[entry.source], entry)
-            ]
+            problems += check_shard(folder, index.sources[entry.source], entry)
             bar.update(entry.scans)
     shards = {name for name in folder.sizes() if name.endswith(".h5")}
-    return (
-        problems
-        + [Problem(name, UNLISTED) for name in sorted(shards - index.by_file.keys())]
-        + check_side_files(folder, index)
-    )
+    return [
+        *problems,
+        *(Problem(name, UNLISTED) for name in sorted(shards - index.by_file.keys())),
+        *check_side_files(folder, index),
+    ]
 
 
-def check_side_files(folder: BankFolder, index: Index) -> list[Problem]:
+def check_side_files(folder: BankFolder, index: Index) -> Iterator[Problem]:
     """The problems of the files beside the shards."""
-    problems = []
     for name in filter(index.files.get, SIDE_FILES):
         try:
             actual = hashlib.sha256(folder.read(name)).hexdigest()
         except (DataError, FileError) as error:
-            problems.append(Problem(name, str(error)))
+            yield Problem(name, str(error))
             continue
         if actual != index.files[name]:
-            what = (
+            yield Problem(
+                name,
                 f"has sha256 {actual[:12]}, the index lists {index.files[name][:12]}: it was "
-                "damaged or edited"
+                "damaged or edited",
             )
-            problems.append(Problem(name, what))
-    return problems
 
 
-def check_shard(folder: BankFolder, facts: Facts, entry: Entry) -> Iterator[str]:
-    """Descriptions of a shard's problems."""
+def check_shard(folder: BankFolder, facts: Facts, entry: Entry) -> Iterator[Problem]:
+    """The problems of a shard."""
     try:
         with folder.local(entry.file, entry.bytes) as path:
             size = path.stat().st_size
             digest = sha256(path)
             if (size, digest) != (entry.bytes, entry.sha256):
-                yield (
+                yield Problem(
+                    entry.file,
                     f"has {size} bytes and sha256 {digest[:12]}, the index lists "
-                    f"{entry.bytes} and {entry.sha256[:12]}"
+                    f"{entry.bytes} and {entry.sha256[:12]}",
                 )
-            yield from check_scans(path, facts, entry)
+            for what in check_scans(path, facts, entry):
+                yield Problem(entry.file, what)
     except OSError as error:
-        yield f"cannot be read ({error.strerror or error})"
+        yield Problem(entry.file, f"cannot be read ({error.strerror or error})")
 
 
 def check_scans(path: Path, facts: Facts | None, entry: Entry | None) -> Iterator[str]:

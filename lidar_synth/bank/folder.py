@@ -76,8 +76,6 @@ class BankFolder(Protocol):
         the block."""
         ...
 
-    def remove(self, names: list[str]) -> None: ...
-
 
 class LocalFolder:
     """A folder on a disk; see ``BankFolder``."""
@@ -118,11 +116,6 @@ class LocalFolder:
     @contextmanager
     def local(self, name: str, size: int) -> Iterator[Path]:
         yield self.root / name
-
-    def remove(self, names: list[str]) -> None:
-        for name in names:
-            with suppress(OSError):
-                (self.root / name).unlink(missing_ok=True)
 
 
 class RemoteFolder:

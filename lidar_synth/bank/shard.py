@@ -97,6 +97,11 @@ class ShardReader:
                 return None
             return self._condition(position).decode()
 
+    def conditions(self, positions: range) -> list[str]:
+        """The names of the scans that some scans are conditioned on; [] in an unconditional bank;
+        raises as ``condition``."""
+        return [name for p in positions if (name := self.condition(p)) is not None]
+
     def chunks(self, position: int) -> tuple[dict[str, bytes], int]:
         """The compressed chunks of one scan and its CRC, after the checks of ``read``; raises as
         ``read``."""
