@@ -24,6 +24,7 @@ from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import check_shard
 from lidar_synth.bank import Bank, ShardReader
+from lidar_synth.bank.folder import LocalFolder
 from lidar_synth.errors import DataError, FileError
 
 
@@ -86,7 +87,7 @@ def checks(root: Path) -> dict[str, Callable[[], str]]:
     found = {who: partial(attempt, read, read()) for who, read in readers.items()}
 
     def verified() -> str:
-        fault = next(check_shard(root, facts, entry), None)
+        fault = next(check_shard(LocalFolder(root), facts, entry), None)
         return "NOT FOUND" if fault is None else "found"
 
     return found | {"verify": verified}
