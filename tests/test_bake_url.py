@@ -123,6 +123,19 @@ def test_a_bake_into_s3_writes_the_bytes_of_a_folder(
     assert len(far) == COUNT and len(far[3].points)
 
 
+def test_a_bake_into_a_file_url_resumes(
+    model: Path, expected: dict[str, bytes], tmp_path: Path
+) -> None:
+    plan = plan_at((tmp_path / "new" / "bank").as_uri(), model)
+    assert bake(plan, share=Share(0, 2), progress=False) is None
+    made: list[int] = []
+    ENGINES["local"](plan, range(4), Resources(), made.append)
+    assert made == [3, 1, 1, 1, 3, 1] and finish(plan) is not None
+    assert files_at(str(plan.out)) == expected
+    assert verify(plan.out, progress=False) == []
+    assert len(open_scans(str(plan.out))) == COUNT
+
+
 def test_shards_are_uploaded_with_their_checksum(model: Path, s3: str) -> None:
     plan = plan_at(new_bucket("sums"), model)
     bake(plan, progress=False)

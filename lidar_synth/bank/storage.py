@@ -229,7 +229,9 @@ def open_system(url: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        options = {}
+        options: dict[str, Any] = {}
+        if scheme == "file":
+            options["auto_mkdir"] = True
         if scheme in ("http", "https"):
             kind = fsspec.get_filesystem_class(scheme)
             configured = fsspec.config.apply_config(kind, {}).get("client_kwargs", {})
