@@ -264,6 +264,23 @@ def test_changed_layouts_are_refused_when_a_bake_resumes_or_is_repaired(
     }
 
 
+def test_layouts_that_are_added_or_removed_between_two_bakes_are_noticed(
+    model: Path, folder: Path, tmp_path: Path
+) -> None:
+    own = Path(shutil.copytree(folder, tmp_path / "layouts"))
+    bake(plan_in(tmp_path / "three", model, condition=str(own)), progress=False)
+    shutil.copy(own / "one.yaml", own / "a.yaml")
+    bake(plan_in(tmp_path / "four", model, condition=str(own)), progress=False)
+    assert [Bank(tmp_path / "four").condition(i) for i in (0, 4)] == ["a", "a"]
+    (tmp_path / "three" / "shard-00000.h5").unlink()
+    with pytest.raises(ConfigError, match="which have changed"):
+        repair(tmp_path / "three", str(model), progress=False)
+    (own / "a.yaml").unlink()
+    assert repair(tmp_path / "three", str(model), progress=False) == {
+        "shard-00000.h5": "regenerated"
+    }
+
+
 def test_a_detector_gets_boxes_from_the_bank_and_from_the_generator(
     bank: Path, model: Path, folder: Path
 ) -> None:

@@ -118,7 +118,7 @@ def conditions_for(
     layout: str | None = None,
     split: str | None = None,
 ) -> ConditionSource | None:
-    """The dataset of a model's conditions, after a check that it fits the model.
+    """The dataset of a model's conditions as it is now, after a check that it fits the model.
 
     Raises:
         ConfigError: if a conditional model gets no conditions or an unconditional one gets some,
@@ -138,6 +138,7 @@ def conditions_for(
             "a dataset whose scans have them" if generator.condition else "none",
             "--condition ROOT (condition=...)" if generator.condition else "",
         )
+    open_conditions.cache_clear()  # there may be more by now
     source = open_conditions(path, layout, split)
     if isinstance(source, LayoutFiles) and generator.condition != "layout":
         raise ConfigError(

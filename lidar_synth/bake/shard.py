@@ -172,6 +172,7 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
         )
     wanted = (facts.condition or {}).get("content")
     if wanted is not None and fingerprint(_source(job)) != wanted:
+        open_conditions.cache_clear()  # they may be restored
         raise ConfigError(
             f"conditions {job.condition}, which have changed since the bank was begun",
             "the files, or the names of scans, of its first shard",
