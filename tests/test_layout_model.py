@@ -253,7 +253,7 @@ def test_changed_layouts_are_refused_when_a_bake_resumes_or_is_repaired(
     (tmp_path / "bank" / "shard-00000.h5").unlink()
     (own / "one.yaml").write_text(LAYOUTS["two"])
     with pytest.raises(
-        ConfigError, match="which have changed since the bank was begun"
+        ConfigError, match="which have moved or changed since the bank was begun"
     ):
         repair(tmp_path / "bank", str(model), progress=False)
     with pytest.raises(ConfigError, match="was filled with .*condition_content"):
@@ -273,9 +273,10 @@ def test_layouts_that_are_added_or_removed_between_two_bakes_are_noticed(
     bake(plan_in(tmp_path / "four", model, condition=str(own)), progress=False)
     assert [Bank(tmp_path / "four").condition(i) for i in (0, 4)] == ["a", "a"]
     (tmp_path / "three" / "shard-00000.h5").unlink()
-    with pytest.raises(ConfigError, match="which have changed"):
+    away = own.rename(tmp_path / "away")
+    with pytest.raises(ConfigError, match="moved or changed since .*--condition"):
         repair(tmp_path / "three", str(model), progress=False)
-    (own / "a.yaml").unlink()
+    (away.rename(own) / "a.yaml").unlink()
     assert repair(tmp_path / "three", str(model), progress=False) == {
         "shard-00000.h5": "regenerated"
     }

@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from lidar_synth.bake.job import DTYPES, BakePlan
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.bank.folder import open_folder
-from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.errors import ConfigError, FileError, LidarSynthError
 from lidar_synth.files.processes import usable_cores
 from lidar_synth.generate.generator import BATCH, Generator
 from lidar_synth.generate.loading import load_generator
@@ -171,10 +171,13 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
             "Give its file with --model.",
         )
     wanted = (facts.condition or {}).get("content")
-    if wanted is not None and fingerprint(_source(job)) != wanted:
+    found = None
+    with suppress(LidarSynthError):
+        found = fingerprint(_source(job))
+    if wanted not in (None, found):
         open_conditions.cache_clear()  # they may be restored
         raise ConfigError(
-            f"conditions {job.condition}, which have changed since the bank was begun",
+            f"conditions {job.condition}, which have moved or changed since the bank was begun",
             "the files, or the names of scans, of its first shard",
             "Restore them, name their dataset with --condition, or bake into another folder.",
         )
