@@ -354,6 +354,24 @@ def test_deep_verification_finds_scans_that_do_not_match_their_seeds(
         call("verify", honest.root, "--deep")
 
 
+def test_a_bank_of_a_gpu_needs_none_to_be_verified_and_repaired(
+    tmp_path: Path, model: Path
+) -> None:
+    made = Bank(baked(tmp_path / "made", model, seed=5, dtype="bfloat16"))
+    settings = made.facts.settings | {"device": "cuda"}
+    stored = {name: getattr(made.facts, name) for name in ("checkpoint", "fields")}
+    images = [made.image(i) for i in range(8)]
+    [first, *_] = write_bank(tmp_path / "gpu", images, settings=settings, **stored)
+    assert (
+        min(regenerate(tmp_path / "gpu", str(model), progress=False).values()) > AGREE
+    )
+    first.unlink()
+    done = repair(tmp_path / "gpu", str(model), progress=False)
+    assert done[first.name].startswith("regenerated")
+    assert verify(tmp_path / "gpu", progress=False) == []
+    assert Bank(tmp_path / "gpu").facts.settings["device"] == "cuda"
+
+
 # Repair
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from lidar_synth.bake.options import BakeJob
@@ -185,7 +186,7 @@ def agreement(one: RangeImage, other: RangeImage) -> float:
 def job_of(
     facts: Facts, model: str | None = None, condition: str | None = None
 ) -> BakeJob:
-    """The settings that regenerate a bank's scans.
+    """The settings that regenerate a bank's scans, on a CPU where there is no GPU.
 
     Args:
         facts: facts of the bank.
@@ -208,6 +209,8 @@ def job_of(
         "fields": facts.fields,
         "condition": condition or facts.settings.get("condition"),
     }
+    if not torch.cuda.is_available():
+        stored["device"] = "cpu"
     try:
         return BakeJob(**facts.settings | stored, model=model or facts.model)
     except (ValueError, TypeError) as error:
