@@ -418,7 +418,8 @@ def test_banks_beyond_repair_are_reported(root: Path, tmp_path: Path) -> None:
 def test_a_repair_with_different_bytes_is_recorded(
     root: Path, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Like a repair on another machine: the scans are equal up to rounding, their bytes differ."""
+    """Like a repair on another machine: the scans are equal up to rounding, their bytes differ.
+    What an interrupted one has made is kept."""
     before = [scan.points for scan in Bank(root)]
     write_shard = repair_module.write_shard
 
@@ -438,14 +439,20 @@ def test_a_repair_with_different_bytes_is_recorded(
                 )
             return images
 
-    monkeypatch.setattr(
-        repair_module,
-        "write_shard",
-        lambda generator, *rest: write_shard(Rounding(generator), *rest),
-    )
-    (root / "shard-00001.h5").unlink()
+    stops = [KeyboardInterrupt]
+
+    def round_or_stop(generator: Any, part: Path, *rest: Any) -> None:
+        if "shard-00002" in part.name and stops:
+            raise stops.pop()
+        write_shard(Rounding(generator), part, *rest)
+
+    monkeypatch.setattr(repair_module, "write_shard", round_or_stop)
+    for name in ("shard-00001.h5", "shard-00002.h5"):
+        (root / name).unlink()
+    with pytest.raises(KeyboardInterrupt):
+        repair(root, str(model), progress=False)
     assert repair(root, str(model), progress=False) == {
-        "shard-00001.h5": "regenerated, with different bytes"
+        "shard-00002.h5": "regenerated, with different bytes"
     }
     assert verify(root, progress=False) == []
     assert "shard-00001.h5 was regenerated with torch" in Bank(root).index.repairs[0]

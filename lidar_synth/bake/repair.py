@@ -104,7 +104,6 @@ def _mend(
         file: "rewritten from the index" for file, _ in check_side_files(folder, index)
     }
     shards = list(index.shards)
-    repairs = list(index.repairs)
     total = sum(entry.scans for entry in shards)
     with tqdm(total=total, desc="repair", unit="scan", disable=not progress) as bar:
         for number, entry in enumerate(shards):
@@ -115,17 +114,18 @@ def _mend(
             shards[number] = new = _regenerate(
                 folder, facts, entry, job_of(facts, model, condition), bar.update
             )
-            same = entry.sha256 in ("", new.sha256)
-            done[entry.file] = "regenerated" + (
-                "" if same else ", with different bytes"
-            )
-            if not same:
-                repairs.append(
+            index = replace(index, shards=tuple(shards))
+            done[entry.file] = "regenerated"
+            if entry.sha256 not in ("", new.sha256):
+                done[entry.file] += ", with different bytes"
+                note = (
                     f"{entry.file} was regenerated with torch {torch.__version__}, with different "
                     "bytes"
                 )
-    mended = replace(index, shards=tuple(shards), repairs=tuple(repairs))
-    return done, mended, baked
+                index = replace(index, repairs=(*index.repairs, note))
+                # now, so that a killed repair has not made it in vain
+                write_bank_files(place, index, baked)
+    return done, index, baked
 
 
 def _regenerate(
