@@ -367,6 +367,31 @@ def test_there_is_one_worker_for_each_core_that_may_be_used(
     assert _resources(plan, None, None, None).workers == workers
 
 
+@pytest.mark.parametrize(
+    ("options", "engine"),
+    [
+        ("", "local"),
+        ("--workers 2", "processes"),
+        ("--workers 2 --address auto", "ray"),
+        ("--workers 2 --slurm cluster=local", "slurm"),
+        ("--workers 2 --engine ray", "ray"),
+    ],
+)
+def test_resources_choose_their_engine(
+    options: str,
+    engine: str,
+    model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    used: list[str] = []
+    for name in ENGINES:
+        monkeypatch.setitem(ENGINES, name, lambda *_, name=name: used.append(name))
+    call = ["bake", str(tmp_path / "bank"), "--model", str(model), *options.split()]
+    CliRunner().invoke(app, call, catch_exceptions=False)
+    assert used == [engine]
+
+
 def test_every_engine_is_named_in_the_help() -> None:
     text = CliRunner().invoke(app, ["bake", "--help"]).output
     assert all(engine in text for engine in ENGINES)

@@ -34,8 +34,12 @@ def bake(
         ),
     ] = None,
     engine: Annotated[
-        str, typer.Option(help="how to run: local | processes | ray | slurm | torchrun")
-    ] = "local",
+        str | None,
+        typer.Option(
+            help="how to run: local | processes | ray | slurm | torchrun "
+            "[the one that --workers, --address or --slurm is for, else local]"
+        ),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -105,19 +109,16 @@ def bake(
         out, validate(BakeJob, values, "bake" if config is None else str(config))
     )
     resources = _resources(plan, workers, address, slurm)
+    engine = engine or (
+        "slurm" if slurm else "ray" if address else "processes" if workers else "local"
+    )
     if dry_run:
         choose("engine", engine, ENGINES)
         _describe(check_settings(plan))
         return
-    quiet = os.environ.get("LOCAL_RANK", "0") != "0"
+    first = os.environ.get("LOCAL_RANK", "0") == "0"
     try:
-        index = run(
-            plan,
-            engine,
-            resources,
-            share,
-            progress=not quiet,
-        )
+        index = run(plan, engine, resources, share, progress=first)
     except KeyboardInterrupt:
         typer.echo(
             f"stopped; finished shards are kept in {out}, the same command resumes",
@@ -192,9 +193,10 @@ def _resources(
                 f"--slurm {item!r}", "KEY=VALUE, such as slurm_partition=gpu"
             )
         options[key] = int(value) if value.isdigit() else value
-    cuda = plan.job.device == "cuda"
-    devices = torch.cuda.device_count() if cuda else usable_cores()
-    return Resources(workers if workers is not None else devices or 1, address, options)
+    if workers is None:
+        cuda = plan.job.device == "cuda"
+        workers = (torch.cuda.device_count() if cuda else usable_cores()) or 1
+    return Resources(workers, address, options)
 
 
 def _describe(plan: "BakePlan") -> None:
@@ -204,24 +206,18 @@ def _describe(plan: "BakePlan") -> None:
     job = plan.job
     shards = plan.shards
     expected = estimate(plan)
-    typer.echo(
-        f"{plan.out}: {job.count} scans in {len(shards)} shards of up to {job.shard_size}"
-    )
-    typer.echo(
-        f"  model {plan.facts.model} {plan.facts.checkpoint[:12]}, sensor {plan.facts.sensor.name}"
-    )
-    typer.echo(
-        f"  fields: range, {', '.join(plan.facts.fields)}; label policy {plan.facts.label_policy}"
-    )
     size = expected.bytes / 1e6
     minutes = expected.seconds / 60
     disk = f"{size:.3g} MB" if size < 1000 else f"{size / 1e3:.3g} GB"
     time = f"{minutes:.1f} minutes" if minutes < 120 else f"{minutes / 60:.1f} hours"
-    typer.echo(f"  about {disk}, {expected.bytes / job.count / 1e3:.0f} kB per scan")
-    typer.echo(
-        f"  about {time} with one worker, {job.count / expected.seconds:.2f} scans/s"
-    )
     shard = size / job.count * max(entry.scans for entry in shards)
     typer.echo(
+        f"{plan.out}: {job.count} scans in {len(shards)} shards of up to {job.shard_size}\n"
+        f"  model {plan.facts.model} {plan.facts.checkpoint[:12]}, sensor "
+        f"{plan.facts.sensor.name}\n"
+        f"  fields: range, {', '.join(plan.facts.fields)}; label policy "
+        f"{plan.facts.label_policy}\n"
+        f"  about {disk}, {expected.bytes / job.count / 1e3:.0f} kB per scan\n"
+        f"  about {time} with one worker, {job.count / expected.seconds:.2f} scans/s\n"
         f"  up to {2 * shard:.3g} MB of memory a worker for its shard, beside the model"
     )
