@@ -388,6 +388,20 @@ def test_a_strange_shard_is_reported(model: Path, expected: dict[str, bytes]) ->
     )
 
 
+def test_a_bank_in_a_folder_below_is_another_one(
+    model: Path, expected: dict[str, bytes]
+) -> None:
+    url = empty_memory()
+    bake(plan_at(f"{url}/val", model), progress=False)
+    bake(plan_at(url, model), progress=False)
+    assert verify(url, progress=False) == []
+    RemoteFolder(url).remove([INDEX])
+    put(f"{url}/val", "shard-00009.h5", expected["shard-00003.h5"])
+    below = files_at(f"{url}/val")
+    assert repair(url, str(model), progress=False) == {INDEX: "rebuilt from the shards"}
+    assert files_at(f"{url}/val") == below
+
+
 def test_a_missing_shard_of_a_finished_bank_is_made_by_a_bake(
     model: Path, expected: dict[str, bytes]
 ) -> None:

@@ -24,6 +24,9 @@ SETTINGS = ".bake.json"
 """File in the bank's folder with the settings of the bake; on a disk, runs that fill the folder
 hold a lock on it."""
 
+SHARD = re.compile(r"[^/]+\.h5")
+"""The name of a shard; those of banks in folders below have a slash."""
+
 _RECORD = re.compile(re.escape(NOTES) + r"/(.+\.h5)-(\d+)-([0-9a-f]{64})")
 
 
@@ -34,7 +37,7 @@ def refuse_others(root: str | Path) -> None:
         ConfigError: naming the file.
     """
     names = open_folder(root).sizes()
-    if INDEX in names or any(name.endswith(".h5") for name in names):
+    if INDEX in names or any(map(SHARD.fullmatch, names)):
         raise ConfigError(
             f"{root} holds another bank", "an empty folder for the new one"
         )

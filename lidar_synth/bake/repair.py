@@ -12,7 +12,7 @@ from lidar_synth.bake.folder import is_claimed, write_bank_files
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.making import NOTE
 from lidar_synth.bake.options import BakeJob
-from lidar_synth.bake.remote import SETTINGS
+from lidar_synth.bake.remote import SETTINGS, SHARD
 from lidar_synth.bake.shard import load_checked, write_shard
 from lidar_synth.bake.verify import (
     check_scans,
@@ -152,7 +152,7 @@ def _index_from_shards(
     Raises:
         DataError: if no shard can be read, or the readable ones come from different bakes.
     """
-    sizes = {name: n for name, n in folder.sizes().items() if name.endswith(".h5")}
+    sizes = {name: n for name, n in folder.sizes().items() if SHARD.fullmatch(name)}
     found = _read_shards(root, sizes)
     if not found:
         raise DataError(

@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from lidar_synth.bake.options import BakeJob
-from lidar_synth.bake.remote import SETTINGS
+from lidar_synth.bake.remote import SETTINGS, SHARD
 from lidar_synth.bake.shard import generate, load_checked, torch_threads
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.card import CARD, CROISSANT
@@ -71,7 +71,7 @@ def verify(root: str | Path, progress: bool = True) -> list[Problem]:
         for entry in index.shards:
             problems += check_shard(folder, index.sources[entry.source], entry)
             bar.update(entry.scans)
-    shards = {name for name in folder.sizes() if name.endswith(".h5")}
+    shards = set(filter(SHARD.fullmatch, folder.sizes()))
     return [
         *problems,
         *(Problem(name, UNLISTED) for name in sorted(shards - index.by_file.keys())),
