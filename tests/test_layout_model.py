@@ -282,6 +282,24 @@ def test_layouts_that_are_added_or_removed_between_two_bakes_are_noticed(
     }
 
 
+def test_a_folder_of_layouts_holds_nothing_else_that_is_visible(
+    model: Path, folder: Path, tmp_path: Path
+) -> None:
+    own = Path(shutil.copytree(folder, tmp_path / "layouts"))
+    (own / ".ipynb_checkpoints").mkdir()
+    (own / "._one.yaml").write_bytes(b"\0\5\x16\7")
+    contents = {
+        plan_in(tmp_path / "bank", model, condition=str(f)).settings[
+            "condition_content"
+        ]
+        for f in (folder, own)
+    }
+    assert len(contents) == 1
+    (own / "README.md").touch()
+    with pytest.raises(DataError, match=r"For layouts: .*README\.md is none"):
+        plan_in(tmp_path / "bank", model, condition=str(own))
+
+
 def test_a_detector_gets_boxes_from_the_bank_and_from_the_generator(
     bank: Path, model: Path, folder: Path
 ) -> None:

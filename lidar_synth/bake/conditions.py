@@ -58,7 +58,7 @@ class LayoutFiles:
     """
 
     def __init__(self, path: Path) -> None:
-        self._files = [path] if path.is_file() else sorted(path.glob("*.y*ml"))
+        self._files = [path] if path.is_file() else sorted(path.glob("[!.]*.y*ml"))
         self.ids = [file.stem for file in self._files]
 
     def __len__(self) -> int:
@@ -88,14 +88,18 @@ def open_conditions(
         FileError, DataError: as ``open_scans``.
     """
     if path is not None:
-        if (
-            layout is None
-            and split is None
-            and len(layouts := LayoutFiles(Path(path)))
-            and _is_yaml(Path(path))
-        ):
+        layouts = LayoutFiles(Path(path))
+        others = _others(Path(path))
+        if len(layouts) and not (layout or split or others):
             return layouts
-        return open_scans(path, layout=layout, split=split)
+        try:
+            return open_scans(path, layout=layout, split=split)
+        except DataError as error:
+            if not (others and len(layouts)):
+                raise
+            raise DataError(
+                f"{error} For layouts: {others[0]} is none; move it elsewhere."
+            ) from error
     if layout is not None or split is not None:
         raise ConfigError(
             f"conditions of layout {layout} and split {split}, but no dataset",
@@ -104,12 +108,10 @@ def open_conditions(
     return None
 
 
-def _is_yaml(path: Path) -> bool:
-    """Whether a path is a YAML file, or a folder with nothing else."""
-    return all(
-        p.suffix in (".yaml", ".yml")
-        for p in (path.iterdir() if path.is_dir() else [path])
-    )
+def _others(path: Path) -> list[Path]:
+    """A file, or the visible ones of a folder, that are no YAML files."""
+    files = [path] if path.is_file() else sorted(path.glob("[!.]*"))
+    return [file for file in files if file.suffix not in (".yaml", ".yml")]
 
 
 def conditions_for(
