@@ -413,6 +413,10 @@ def test_banks_beyond_repair_are_reported(root: Path, tmp_path: Path) -> None:
     (tmp_path / "strange" / "shard-00000.h5").unlink()
     with pytest.raises(ConfigError, match="model 'small'; expected a shipped one"):
         repair(tmp_path / "strange", progress=False)
+    [shard] = write_bank(tmp_path / "recorded", [some_image()], checkpoint="")
+    shard.unlink()
+    with pytest.raises(DataError, match="recorded scans, which no model makes again"):
+        repair(tmp_path / "recorded", progress=False)
 
 
 def test_a_repair_with_different_bytes_is_recorded(

@@ -196,6 +196,10 @@ def job_of(
     Raises:
         DataError: if the facts hold no valid settings.
     """
+    if facts.recorded:
+        raise DataError(
+            "recorded scans, which no model makes again", "a copy of the bank"
+        )
     if "as_sensor" in facts.settings:
         raise DataError(
             f"scans of {facts.model!r} that were turned into scans of {facts.sensor.name!r}",

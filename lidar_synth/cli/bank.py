@@ -61,7 +61,9 @@ def verify(
     if problems:
         typer.echo(f"{bank}: {len(problems)} problems")
         if any(problem.what != UNLISTED for problem in problems):
-            typer.echo(f"lidar-synth repair {quote(bank)} regenerates what is damaged.")
+            typer.echo(
+                f"lidar-synth repair {quote(bank)} regenerates what a model has made."
+            )
         raise typer.Exit(1)
     typer.echo(f"{bank}: intact")
     if not deep:
