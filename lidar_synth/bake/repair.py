@@ -152,24 +152,25 @@ def _index_from_shards(
     Raises:
         DataError: if no shard can be read, or the readable ones come from different bakes.
     """
+    lost = str(damage).split("; expected")[0]
     sizes = {name: n for name, n in folder.sizes().items() if SHARD.fullmatch(name)}
     found = _read_shards(root, sizes)
     if not found:
         raise DataError(
-            f"{damage}, and no shard of {root} can be read", "at least one intact shard"
+            f"{lost}, and no shard of {root} can be read", "at least one intact shard"
         ) from damage
     facts, _ = found[0]
     shards = BakePlan(root, job_of(facts), facts).shards
     if any(other != facts for other, _ in found) or {e for _, e in found} - set(shards):
         raise DataError(
-            f"{damage}, and the shards of {root} are of different bakes",
+            f"{lost}, and the shards of {root} are of different bakes",
             "a copy of the index",
         ) from damage
     absent = [entry.file for entry in shards if entry.file not in sizes]
     if absent and not is_claimed(root):
         # The part of a split, too, has the first shards of a bake.
         raise DataError(
-            f"{damage}, and {absent[0]} is not there, nor {SETTINGS}, which a bake leaves",
+            f"{lost}, and {absent[0]} is not there, nor {SETTINGS}, which a bake leaves",
             "a copy of the index",
         ) from damage
     return Index((facts,), tuple(_measured(folder, facts, e, sizes) for e in shards))

@@ -348,13 +348,19 @@ def read_index(root: str | Path) -> Index:
 
 
 def _read_index(root: str | Path) -> bytes:
-    if isinstance(root, str):
-        return RemoteFile(f"{root}/{INDEX}").read_all()
+    read = (
+        RemoteFile(f"{root}/{INDEX}").read_all
+        if isinstance(root, str)
+        else (root / INDEX).read_bytes
+    )
     try:
-        return (root / INDEX).read_bytes()
+        return read()
     except OSError as error:
+        cause = error.__cause__
+        if isinstance(error, FileError) and not isinstance(cause, FileNotFoundError):
+            raise  # a failure of the network
         raise FileError(
-            f"{root} holds no bank: {INDEX} cannot be read ({error.strerror})",
+            f"{root} holds no bank: {INDEX} cannot be read ({error.strerror or cause})",
             "the folder of a finished bank",
             "Run an interrupted bake again to resume it; lidar-synth repair rebuilds a lost index.",
         ) from error

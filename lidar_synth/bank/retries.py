@@ -42,7 +42,7 @@ def keep_trying(url: str, what: str, request: Callable[[], T]) -> T:
             if wait is None or late or not _may_pass(error):
                 reason = str(error) or type(error).__name__
                 raise FileError(
-                    f"{url} cannot be {what} ({reason})", "a file of a bank"
+                    f"{url} cannot be {what} ({reason})", f"a URL that can be {what}"
                 ) from error
         time.sleep(wait)
     raise AssertionError
