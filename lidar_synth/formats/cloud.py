@@ -15,13 +15,15 @@ number of photons. Names of the reflectance may have capitals, and CloudCompare'
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import SKIP_HINT
+from lidar_synth.files.disk import SKIP_HINT, read_start
+from lidar_synth.formats.description import Description, from_comments
 from lidar_synth.formats.npz import TYPES
 from lidar_synth.geometry.scan import Scan
 
@@ -56,6 +58,12 @@ than the points take, whatever the length of the header."""
 
 WIDEST = 1 << 20
 """Maximum number of bytes of one point."""
+
+LONGEST_HEADER = 1 << 16
+"""Maximum length of a header in bytes."""
+
+COMMENTS = {".pcd": ("#", "DATA"), ".ply": ("comment", "end_header")}
+"""{suffix: beginning of a comment, end of the header}."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +147,22 @@ def check_fields(fields: Sequence[Field], count: int, where: str) -> None:
         )
     if count == 0:
         raise DataError(f"{where} holds no points", "at least one point", SKIP_HINT)
+
+
+def read_header_description(path: Path) -> Description | None:
+    """What the comments of a ``.pcd`` or ``.ply`` file say about its scan; None if they say
+    nothing, or the file is of another kind.
+
+    Raises:
+        FileError: if it cannot be read.
+        DataError: on a damaged description.
+    """
+    mark, end = COMMENTS.get(path.suffix.lower(), ("", ""))
+    if not mark:
+        return None
+    lines = read_start(path, LONGEST_HEADER).split(f"\n{end}", 1)[0].splitlines()
+    said = (line.removeprefix(mark) for line in lines if line.startswith(mark))
+    return from_comments(said, str(path))
 
 
 def from_records(

@@ -27,7 +27,7 @@ from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import files_below, read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_arrays
-from lidar_synth.formats.cloud import REFLECTANCES, seconds
+from lidar_synth.formats.cloud import REFLECTANCES, read_header_description, seconds
 from lidar_synth.formats.description import Description
 from lidar_synth.formats.npz import (
     check_numbers,
@@ -35,8 +35,8 @@ from lidar_synth.formats.npz import (
     read_stored_sensor,
     write_scan,
 )
-from lidar_synth.formats.pcd import read_pcd, read_pcd_description, write_pcd
-from lidar_synth.formats.ply import read_ply, read_ply_description, write_ply
+from lidar_synth.formats.pcd import encode_pcd, read_pcd
+from lidar_synth.formats.ply import encode_ply, read_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import check_scale, check_scan, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -144,7 +144,7 @@ class Folder(ScanFiles):
             scan.reflectance = scan.reflectance / np.float32(most or 1)
             return scan
         arrays = ARRAYS[suffix](path)
-        said = _description(path)
+        said = read_header_description(path)
         sensor = self._given or (said and said.sensor) or self.sensor
         return as_scan(arrays, said, sensor, path, most, not self._unknown)
 
@@ -296,18 +296,6 @@ ARRAYS: dict[str, Callable[[Path], dict[str, NDArray[Any]]]] = {
 }
 """{suffix: reader of a scan's arrays}."""
 
-HEADERS: dict[str, Callable[[Path], Description | None]] = {
-    ".pcd": read_pcd_description,
-    ".ply": read_ply_description,
-}
-"""{suffix: reader of what the header of a file says about its scan}."""
-
-
-def _description(path: Path) -> Description | None:
-    """What the header of a file says about its scan; None if it says nothing."""
-    read = HEADERS.get(path.suffix.lower())
-    return None if read is None else read(path)
-
 
 def _named_sensor(path: Path) -> Sensor | None:
     """The sensor that a file names; None if it names none, or if reading the scan will raise an
@@ -315,7 +303,7 @@ def _named_sensor(path: Path) -> Sensor | None:
     if path.suffix.lower() == ".npz":
         return read_stored_sensor(path)
     try:
-        said = _description(path)
+        said = read_header_description(path)
     except (DataError, FileError):
         return None
     return None if said is None else said.sensor
@@ -393,18 +381,16 @@ class PCDWriter(FileWriter):
 
     suffix = ".pcd"
     keeps = frozenset({*POINT_FIELDS, "boxes"})
+    encode: "staticmethod[[Scan], bytes]" = staticmethod(encode_pcd)
 
     def _write_file(self, path: Path, scan: Scan) -> None:
+        content = self.encode(scan)
         write_boxes(path, scan.boxes)
-        write_pcd(path, scan)
+        write_file(path, content)
 
 
 class PLYWriter(PCDWriter):
-    """Writes ``NAME.ply`` with the scan's points and fields, and its boxes to ``NAME.boxes.json``,
-    without pose."""
+    """Writes ``NAME.ply``, with what ``PCDWriter`` writes."""
 
     suffix = ".ply"
-
-    def _write_file(self, path: Path, scan: Scan) -> None:
-        write_boxes(path, scan.boxes)
-        write_ply(path, scan)
+    encode = staticmethod(encode_ply)

@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthError
-from lidar_synth.files.disk import open_file, write_file
+from lidar_synth.files.disk import open_file
 from lidar_synth.formats.cloud import Field, check_fields, to_arrays, to_records
 from lidar_synth.formats.description import Description, from_comments, to_comments
-from lidar_synth.formats.folder import as_scan, has_files, scan_paths, write_boxes
+from lidar_synth.formats.folder import PCDWriter, as_scan, has_files, scan_paths
 from lidar_synth.formats.points import check_scale
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import FileWriter
-from lidar_synth.geometry.scan import POINT_FIELDS, Scan
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 
 SUFFIX = ".mcap"
@@ -133,20 +132,7 @@ class MCAP(ScanFiles):
         return scan
 
 
-class MCAPWriter(FileWriter):
-    """Writes ``NAME.mcap`` with the scan's points and fields, and its boxes to
-    ``NAME.boxes.json``, without pose."""
-
-    suffix = SUFFIX
-    keeps = frozenset({*POINT_FIELDS, "boxes"})
-
-    def _write_file(self, path: Path, scan: Scan) -> None:
-        content = _encode(scan)
-        write_boxes(path, scan.boxes)
-        write_file(path, content)
-
-
-def _encode(scan: Scan) -> bytes:
+def encode_mcap(scan: Scan) -> bytes:
     """The file of a scan."""
     with _library():
         from mcap_ros2.writer import Writer
@@ -175,6 +161,13 @@ def _encode(scan: Scan) -> bytes:
         text = "\n".join(to_comments(scan))
         file.add_metadata(METADATA, {"description": text})
     return out.getvalue()
+
+
+class MCAPWriter(PCDWriter):
+    """Writes ``NAME.mcap``, with what ``PCDWriter`` writes."""
+
+    suffix = SUFFIX
+    encode = staticmethod(encode_mcap)
 
 
 def _survey(

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import SKIP_HINT, read_file, read_start, write_file
+from lidar_synth.files.disk import SKIP_HINT, read_file
 from lidar_synth.formats.cloud import (
+    LONGEST_HEADER,
     Field,
     check_fields,
     check_size,
@@ -25,11 +26,8 @@ from lidar_synth.formats.cloud import (
     to_arrays,
     to_records,
 )
-from lidar_synth.formats.description import Description, from_comments, to_comments
+from lidar_synth.formats.description import to_comments
 from lidar_synth.geometry.scan import Scan
-
-LONGEST_HEADER = 1 << 16
-"""Maximum length of a header in bytes."""
 
 MOST_EXPANSION = 89
 """Maximum factor of decompression: LZF expands 3 bytes to at most 264."""
@@ -40,12 +38,8 @@ _SIZES = {"F": "48", "I": "1248", "U": "1248"}
 """{type: possible sizes of a value in bytes}."""
 
 
-def write_pcd(path: Path, scan: Scan) -> None:
-    """Write a scan as binary ``.pcd``; ``read_pcd`` is the inverse.
-
-    Raises:
-        FileError: if it cannot be written.
-    """
+def encode_pcd(scan: Scan) -> bytes:
+    """A scan as a binary ``.pcd`` file; ``read_pcd`` is the inverse."""
     records = to_records(scan)
     types = [records.dtype[name] for name in records.dtype.names or ()]
     lines = [
@@ -62,7 +56,7 @@ def write_pcd(path: Path, scan: Scan) -> None:
         f"POINTS {len(records)}",
         "DATA binary\n",
     ]
-    write_file(path, "\n".join(lines).encode() + records.tobytes())
+    return "\n".join(lines).encode() + records.tobytes()
 
 
 def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
@@ -94,19 +88,6 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
         )
     check_size(body, size, where)
     return to_arrays(from_records(body, fields, count))
-
-
-def read_pcd_description(path: Path) -> Description | None:
-    """What the comments of a ``.pcd`` file say about its scan; None if they say nothing.
-
-    Raises:
-        FileError: if it cannot be read.
-        DataError: on a damaged description.
-    """
-    lines = read_start(path, LONGEST_HEADER).split("\nDATA", 1)[0].splitlines()
-    return from_comments(
-        (line[1:] for line in lines if line.startswith("#")), str(path)
-    )
 
 
 def _header(text: str, where: str) -> tuple[list[Field], int]:

@@ -15,14 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import (
-    SKIP_HINT,
-    open_file,
-    read_file,
-    read_start,
-    write_file,
-)
+from lidar_synth.files.disk import SKIP_HINT, open_file, read_file
 from lidar_synth.formats.cloud import (
+    LONGEST_HEADER,
     Field,
     check_fields,
     check_size,
@@ -32,11 +27,8 @@ from lidar_synth.formats.cloud import (
     to_arrays,
     to_records,
 )
-from lidar_synth.formats.description import Description, from_comments, to_comments
+from lidar_synth.formats.description import to_comments
 from lidar_synth.geometry.scan import Scan
-
-LONGEST_HEADER = 1 << 16
-"""Maximum length of a header in bytes."""
 
 TYPES = {
     "char": "i1",
@@ -76,14 +68,10 @@ class Element:
         return self.count * sum(f.width for f in self.fields)
 
 
-def write_ply(path: Path, scan: Scan) -> None:
-    """Write a scan as binary ``.ply``; ``read_ply`` is the inverse.
-
-    Raises:
-        FileError: if it cannot be written.
-    """
+def encode_ply(scan: Scan) -> bytes:
+    """A scan as a binary ``.ply`` file; ``read_ply`` is the inverse."""
     records = to_records(scan)
-    write_file(path, vertex_header(records, to_comments(scan)) + records.tobytes())
+    return vertex_header(records, to_comments(scan)) + records.tobytes()
 
 
 def vertex_header(records: NDArray[np.void], comments: Iterable[str] = ()) -> bytes:
@@ -170,20 +158,6 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
     start = sum(e.size for e in elements[:position])
     return to_arrays(
         from_records(body[start : start + vertex.size], vertex.fields, vertex.count)
-    )
-
-
-def read_ply_description(path: Path) -> Description | None:
-    """What the comments of a ``.ply`` file say about its scan; None if they say nothing.
-
-    Raises:
-        FileError: if it cannot be read.
-        DataError: on a damaged description.
-    """
-    lines = read_start(path, LONGEST_HEADER).split("\nend_header", 1)[0].splitlines()
-    return from_comments(
-        (line.removeprefix("comment") for line in lines if line.startswith("comment")),
-        str(path),
     )
 
 
