@@ -307,7 +307,8 @@ def test_arrays_that_are_not_scans_are_refused(tmp_path: Path) -> None:
     write_all("npz", tmp_path, [scan])
     good = dict(np.load(tmp_path / "000000.npz"))
     for change, message in (
-        ({"points": good["points"].astype("f8")}, "points is float64"),
+        ({"points": good["points"].astype(str)}, "points is <U32; expected numbers"),
+        ({"label": good["label"] + 0.5}, "whole numbers that uint8 can hold"),
         ({"points": np.where(np.arange(3) == 1, np.nan, good["points"])}, "NaN"),
         ({"reflectance": good["reflectance"] * 255}, r"expected values in \[0, 1\]"),
         ({"reflectance": good["reflectance"][1:]}, "one per point"),
@@ -326,9 +327,29 @@ def test_arrays_that_are_not_scans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="it has no sensor"):
         open_scans(path)[0]
     assert len(open_scans(path, sensor="hdl64e_kitti")[0]) == len(scan)
-    np.savez(path, points=np.array([{"a": 1}], object))
+    np.savez(path, points=good["points"], intensity=good["reflectance"])
+    with pytest.raises(DataError, match="holds points, intensity; expected points, re"):
+        open_scans(path, sensor="hdl64e_kitti")[0]
+    np.savez(path, points=np.array([{"a": 1}], object), reflectance=[0])
     with pytest.raises(DataError, match="none of them pickled"):
         open_scans(path)[0]
+
+
+def test_arrays_of_other_types_are_converted(tmp_path: Path) -> None:
+    scan = some_scan()
+    assert scan.label is not None
+    grey = np.round(scan.reflectance * 255).astype(np.uint8)
+    np.savez(
+        tmp_path / "a.npz",
+        points=scan.points.astype(np.float64),
+        reflectance=grey,
+        label=scan.label.astype(np.int64),
+    )
+    read = open_scans(tmp_path, sensor=scan.sensor, reflectance_max=255)[0]
+    assert read.points.dtype == np.float32 and np.array_equal(read.points, scan.points)
+    assert np.allclose(read.reflectance, grey / 255)
+    assert read.label is not None and read.label.dtype == np.uint8
+    assert np.array_equal(read.label, scan.label)
 
 
 def test_a_range_image_of_another_sensor(tmp_path: Path) -> None:

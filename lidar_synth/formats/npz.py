@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
-from lidar_synth.errors import DataError, LidarSynthError
+from lidar_synth.errors import DataError, LidarSynthError, shorten
 from lidar_synth.files.disk import SKIP_HINT, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.formats.description import check_provenance
@@ -119,19 +119,20 @@ def decode_scan(
         sensor: takes precedence over the file's own sensor.
 
     Raises:
-        DataError: if points, reflectance or the sensor is missing, or has a wrong shape or type.
+        DataError: if points, reflectance or the sensor is missing, or has a wrong shape; as
+            ``to_stored``.
     """
+    expected = "points, reflectance and sensor of a scan"
+    if not {"points", "reflectance"} <= arrays.keys():
+        raise DataError(f"{where} holds {shorten(', '.join(arrays), 100)}", expected)
+    known: dict[str, Any] = to_stored(
+        {n: a for n, a in arrays.items() if n in TYPES}, where
+    )
     try:
         facts = _known(arrays, sensor) | ({} if sensor is None else {"sensor": sensor})
-        known: dict[str, Any] = {
-            name: arrays[name] for name in POINT_FIELDS if name in arrays
-        }
-        _check_types({"points": arrays["points"], **known})
-        return Scan(arrays["points"], **known, **facts)
+        return Scan(**known, **facts)
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{where}: {error}", "points, reflectance and sensor of a scan"
-        ) from error
+        raise DataError(f"{where}: {error}", expected) from error
 
 
 def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -> None:
@@ -163,18 +164,18 @@ def decode_range_image(
     Raises:
         DataError: if range or sensor is missing, or a shape does not match the sensor.
     """
+    channels = {
+        n: a
+        for n, a in arrays.items()
+        if n not in ("range", *FACTS) and not n.startswith(BOX)
+    }
+    channels = to_stored(channels, where)
     try:
         facts = _known(arrays, sensor)
         if sensor is not None and sensor.shape != facts["sensor"].shape:
             raise ValueError(
                 f"it was made for sensor {facts['sensor'].name!r}, not for {sensor.name!r}"
             )
-        channels = {
-            n: a
-            for n, a in arrays.items()
-            if n not in ("range", *FACTS) and not n.startswith(BOX)
-        }
-        _check_types(channels)
         return range_image(arrays["range"], facts["sensor"], channels, where), facts
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(
@@ -245,16 +246,6 @@ def check_numbers(array: NDArray[Any], where: str) -> None:
     """
     if array.dtype.kind not in "biuf":
         raise DataError(f"{where} holds {array.dtype}", "numbers", SKIP_HINT)
-
-
-def _check_types(arrays: Mapping[str, NDArray[Any]]) -> None:
-    for name, values in arrays.items():
-        if values.dtype.kind not in "biuf" or values.dtype != TYPES.get(
-            name, values.dtype
-        ):
-            raise ValueError(
-                f"{name} is {values.dtype}, not {TYPES.get(name, 'a number')}"
-            )
 
 
 def _sensor(arrays: Mapping[str, NDArray[Any]]) -> Sensor:
