@@ -4,7 +4,9 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import numpy as np
@@ -437,6 +439,30 @@ def test_other_options_of_the_reader_do_not_keep_the_old_scans(tmp_path: Path) -
             as_sensor=target,
             progress=False,
         )
+
+
+@pytest.mark.parametrize(
+    ("layout", "chosen"),
+    [
+        ("pandaset", {"motion_compensated": True}),
+        ("pandaset", {"camera": "back_camera"}),
+        ("semantic_kitti", {"taxonomy": replace(SEMANTIC_KITTI, to_train={0: IGNORE})}),
+        ("kitti360", {"labels": "labels"}),
+        ("mcap", {"topic": "/points"}),
+    ],
+)
+def test_an_option_that_changes_the_scans_is_not_resumed_over(
+    layout: str, chosen: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    MAKERS[layout](tmp_path / "in")
+    if layout == "kitti360":
+        copytree(tmp_path / "in", tmp_path / "labels")
+    plain: Any = READERS[layout]
+    out = WRITERS["npz"](tmp_path / "out")
+    claim(out.root / SETTINGS, _settings(plain(tmp_path / "in"), out, None, False))
+    with pytest.raises(ConfigError, match=f"was filled with.*'{next(iter(chosen))}'"):
+        convert(plain(tmp_path / "in", **chosen), out, progress=False)
 
 
 def test_a_folder_is_not_converted_into_itself(tmp_path: Path) -> None:

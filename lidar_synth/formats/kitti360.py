@@ -154,6 +154,8 @@ class KITTI360(ScanFiles):
                     "clouds.",
                 )
         super().__init__(home, ids, sensor, on_bad)
+        if self._labels not in (home, found):
+            self._chosen["labels"] = str(self._labels.resolve())
         self.root = Path(root)  # by which others open the same scans
         self._home = home
         self._camera = read_calibration(home)

@@ -116,10 +116,12 @@ class MCAP(ScanFiles):
         said = self._said[paths[0]]
         stored = said.sensor if said else None
         super().__init__(root, ids, sensor, on_bad, stored=stored)
+        if topic is not None:
+            self._chosen["topic"] = topic
 
     @property
     def options(self) -> dict[str, Any]:
-        return {"reflectance_max": self._reflectance_max}
+        return {"reflectance_max": self._reflectance_max} | self._chosen
 
     def read(self, index: int) -> Scan:
         place = self._places[index]

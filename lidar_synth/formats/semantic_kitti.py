@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import SEMANTIC_KITTI, Taxonomy
 from lidar_synth.errors import DataError, choose
 from lidar_synth.files.disk import (
+    hash_of_names,
     list_files,
     name_errors,
     numbers,
@@ -132,6 +133,9 @@ class SemanticKITTI(ScanFiles):
             for p in list_files(folder / "velodyne", ".bin")
         ]
         super().__init__(root, ids, sensor, on_bad)
+        if taxonomy != SEMANTIC_KITTI:
+            table = hash_of_names(map(str, sorted(taxonomy.to_train.items())))
+            self._chosen["taxonomy"] = [taxonomy.name, table]
         self._labelled = {s for s, f in folders.items() if (f / "labels").is_dir()}
         self._cameras = {s: read_calibration(f) for s, f in folders.items()}
         self._poses = {s: read_poses(f, self._cameras[s]) for s, f in folders.items()}

@@ -104,14 +104,16 @@ class ScanFiles(ABC):
         self._unchecked = named is None
         self._unknown = False
         self.on_bad = on_bad
+        self._chosen: dict[str, Any] = {}
         self.skipped: dict[str, str] = {}
         self.dropped: dict[str, int] = {}
 
     @property
     def options(self) -> dict[str, Any]:
-        """Further options of the reader that determine its scans, as plain values."""
+        """Further options of the reader that determine its scans, as plain values; those that are
+        not chosen are missing, or have their default."""
         scale = self._reflectance_max
-        return {} if scale is None else {"reflectance_max": scale}
+        return self._chosen | ({} if scale is None else {"reflectance_max": scale})
 
     @abstractmethod
     def read(self, index: int) -> Scan:
