@@ -124,11 +124,27 @@ def test_scans_are_in_the_order_of_their_times(tmp_path: Path) -> None:
 
 def test_several_topics_need_a_choice(tmp_path: Path) -> None:
     record(tmp_path / "a.mcap", [("/left", 0, cloud(0)), ("/right", 1, cloud(1))])
-    with pytest.raises(ConfigError, match=r"on /left, /right; expected one topic.*"):
+    with pytest.raises(
+        ConfigError, match=r"on /left, /right; expected one topic.*--to"
+    ):
         open_scans(tmp_path)
-    assert len(MCAP(tmp_path, topic="/right")) == 1
-    with pytest.raises(DataError, match="holds no scan"):
+    assert len(open_scans(tmp_path, topic="/right")) == 1
+    with pytest.raises(ConfigError, match="on /left, /right; expected /middle"):
         MCAP(tmp_path, topic="/middle")
+
+
+def test_topics_of_several_files_are_not_mixed(tmp_path: Path) -> None:
+    record(tmp_path / "a.mcap", [("/front", 0, cloud(0))])
+    record(tmp_path / "b.mcap", [("/rear", 0, cloud(1))])
+    with pytest.raises(ConfigError, match="on /front, /rear; expected one topic"):
+        MCAP(tmp_path)
+    assert MCAP(tmp_path, topic="/rear").ids == ("b",)
+
+
+def test_parts_of_a_record_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for number in (2, 10, 1):
+        record(tmp_path / f"bag_{number}.mcap", [("/points", number, cloud(number))])
+    assert MCAP(tmp_path).ids == ("bag_1", "bag_2", "bag_10")
 
 
 def test_a_file_without_point_clouds(tmp_path: Path) -> None:

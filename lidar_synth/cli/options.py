@@ -57,6 +57,7 @@ class Reading(BaseModel):
     fields: int | None = Field(
         None, description="floats per point in plain .bin files [4]"
     )
+    topic: str | None = Field(None, description="topic of MCAP files with several")
     reflectance_max: float | None = Field(
         None,
         description="highest reflectance value in plain files, MCAP, semantic_kitti and "

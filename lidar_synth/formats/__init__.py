@@ -105,6 +105,7 @@ def open_scans(
     layout: str | None = None,
     split: str | None = None,
     fields: int | None = None,
+    topic: str | None = None,
     reflectance_max: float | None = None,
     on_bad: OnBad = "error",
 ) -> ScanFiles:
@@ -116,6 +117,7 @@ def open_scans(
         layout: one of ``READERS``; by default it is recognised from the files.
         split: name of a split, if the layout has splits.
         fields: floats per point of plain ``.bin`` files.
+        topic: of the point clouds of MCAP files with several.
         reflectance_max: maximum of the reflectance in plain files, MCAP and KITTI's layouts with
             labels, such as 255; values are divided by it.
         on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` skips it, with a
@@ -149,6 +151,7 @@ def open_scans(
         "sensor": sensor,
         "split": split,
         "fields": fields,
+        "topic": topic,
         "reflectance_max": reflectance_max,
     }
     options = {key: value for key, value in given.items() if value is not None}

@@ -31,7 +31,7 @@ from lidar_synth.formats.description import (
     Description,
     Origin,
 )
-from lidar_synth.formats.folder import scan_paths
+from lidar_synth.formats.folder import find_scans
 from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -83,16 +83,8 @@ class Cosmos(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
-        base, paths = scan_paths(root, (SUFFIX,))
-        self._places: list[tuple[Path, int]] = []
-        self._said: dict[Path, Description | None] = {}
-        ids = []
-        for path in paths:
-            sweeps, self._said[path] = _survey(path)
-            name = path.relative_to(base).with_suffix("").as_posix()
-            ids += [name] if sweeps == 1 else [f"{name}/{t:06d}" for t in range(sweeps)]
-            self._places += [(path, t) for t in range(sweeps)]
-        stored = _sensor(self._said[paths[0]])
+        ids, self._places, self._said = find_scans(root, SUFFIX, _survey)
+        stored = _sensor(self._said[self._places[0][0]])
         super().__init__(root, ids, sensor, on_bad, stored=stored)
         self.skip_sensor_check()  # the grid is the sensor's
 
@@ -175,8 +167,8 @@ def write_sweeps(path: str | Path, scans: Sequence[Scan]) -> None:
     write_file(Path(path), content)
 
 
-def _survey(path: Path) -> tuple[int, Description | None]:
-    """The number of sweeps of a file, and what it says about them."""
+def _survey(path: Path) -> tuple[range, Description | None]:
+    """The sweeps of a file, and what it says about them."""
     with _opened(path) as file:
         names = sorted(file.keys())
         found = file.get_slice(TENSOR) if TENSOR in names else None
@@ -189,10 +181,10 @@ def _survey(path: Path) -> tuple[int, Description | None]:
             f"a tensor {TENSOR} of float32, (3, T, 128, 1800)",
         )
     if text is None:
-        return shape[1], None
+        return range(shape[1]), None
     where = f"{path}: its description"
     try:
-        return shape[1], Description.from_dict(parse_json(text, where))
+        return range(shape[1]), Description.from_dict(parse_json(text, where))
     except ValueError as error:
         raise DataError(f"{where} is damaged ({error})", "an intact file") from error
 

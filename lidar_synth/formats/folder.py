@@ -14,11 +14,11 @@ without the suffix.
 
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,8 @@ from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.projection.unfold import rows_by_elevation
 from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
+
+Place = TypeVar("Place")
 
 LOG_REFLECTANCE = 255.0
 """Maximum of the reflectance in the logs of Velodyne's, Hesai's and Ouster's drivers."""
@@ -105,10 +107,7 @@ class Folder(ScanFiles):
             raise ConfigError(f"fields={fields}", "at least 4")
         self._reflectance_max = check_scale(reflectance_max)
         root = Path(root)
-        base, self._paths = scan_paths(root, SUFFIXES)
-        ids = [
-            path.relative_to(base).with_suffix("").as_posix() for path in self._paths
-        ]
+        ids, self._paths = scan_paths(root, SUFFIXES)
         super().__init__(
             root, ids, sensor, on_bad, stored=_named_sensor(self._paths[0])
         )
@@ -315,8 +314,17 @@ def has_files(root: Path, suffixes: tuple[str, ...]) -> bool:
     return any(path.suffix.lower() in suffixes for path in paths)
 
 
-def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]:
-    """The folder to which names are relative, and the paths of the scans in order.
+def scan_paths(
+    root: Path,
+    suffixes: tuple[str, ...],
+    order: Callable[[Path], Any] | None = None,
+) -> tuple[list[str], list[Path]]:
+    """The names of a path's files, which are relative and without suffix, and their paths.
+
+    Args:
+        root: the folder or the file.
+        suffixes: of the files.
+        order: key by which the files are sorted; by default by path.
 
     Raises:
         FileError: if the path does not exist.
@@ -328,15 +336,16 @@ def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]
             raise ConfigError(
                 f"{root} is not a scan", f"a file with one of {', '.join(suffixes)}"
             )
-        return root.parent, [root]
+        return [root.stem], [root]
     if not root.is_dir():
         raise FileError(f"{root} does not exist", "a file or a folder with scans")
     found = (path for path in files_below(root) if path.suffix.lower() in suffixes)
-    paths = sorted(
+    shown = (
         p
         for p in found
         if not any(part[0] == "." for part in p.relative_to(root).parts)
     )
+    paths = sorted(shown, key=order)
     kinds = sorted({path.suffix.lower() for path in paths})
     if len(kinds) > 1:
         raise ConfigError(
@@ -348,7 +357,35 @@ def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]
         raise DataError(
             f"{root} holds no scan", f"files with one of {', '.join(suffixes)}"
         )
-    return root, paths
+    return [p.relative_to(root).with_suffix("").as_posix() for p in paths], paths
+
+
+def find_scans(
+    root: Path,
+    suffix: str,
+    survey: Callable[[Path], tuple[Sequence[Place], Description | None]],
+    order: Callable[[Path], Any] | None = None,
+) -> tuple[list[str], list[tuple[Path, Place]], dict[Path, Description | None]]:
+    """The scans of files that hold several each: their ids, their files and places in them, and
+    what each file says, of which the first counts.
+
+    Args:
+        root, order: as for ``scan_paths``.
+        suffix: of the files.
+        survey: gives the places of a file's scans, and what it says.
+
+    Raises:
+        ConfigError, DataError, FileError: as ``scan_paths`` and ``survey``.
+    """
+    ids = []
+    found = []
+    said = {}
+    for name, path in zip(*scan_paths(root, (suffix,), order), strict=True):
+        places, said[path] = survey(path)
+        numbers = range(len(places))
+        ids += [name] if len(places) == 1 else [f"{name}/{n:06d}" for n in numbers]
+        found += [(path, place) for place in places]
+    return ids, found, said
 
 
 class KITTIWriter(FileWriter):

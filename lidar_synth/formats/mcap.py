@@ -7,6 +7,7 @@ on the topic ``/points``, all fields of the scan (lossless), its description in 
 ``lidar_synth``, and its boxes in ``NAME.boxes.json``. ``mcap merge`` joins such files.
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -20,7 +21,7 @@ from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthE
 from lidar_synth.files.disk import open_file
 from lidar_synth.formats.cloud import Field, check_fields, to_arrays, to_records
 from lidar_synth.formats.description import Description, from_comments, to_comments
-from lidar_synth.formats.folder import PCDWriter, as_scan, has_files, scan_paths
+from lidar_synth.formats.folder import PCDWriter, as_scan, find_scans, has_files
 from lidar_synth.formats.points import check_scale
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry.scan import Scan
@@ -61,7 +62,6 @@ class MessagePlace(NamedTuple):
     """Where a message is: in the chunk at byte ``chunk`` of a file, ``offset`` bytes from the
     beginning of the chunk's records."""
 
-    path: Path
     chunk: int
     offset: int
 
@@ -73,13 +73,13 @@ class MCAP(ScanFiles):
         root: the folder or the file.
         sensor: the sensor that recorded the scans; by default the one that the files name
             (written by this package), or ``scans.json`` beside them, or else ``hdl64e_kitti``.
-        topic: of the messages; it is needed where a file has several.
+        topic: of the messages; it is needed where there are several.
         reflectance_max: maximum of the reflectance in the files, see ``Folder``.
         on_bad: see ``ScanFiles``.
 
     Raises:
         FileError: if the path does not exist.
-        ConfigError: if a file has several topics with point clouds; on an invalid
+        ConfigError: if there are several topics with point clouds, or not this one; on an invalid
             ``reflectance_max``.
         DataError: if there is no scan, or a file is damaged or has no index.
         LibraryError: without the extra ``mcap``.
@@ -103,17 +103,17 @@ class MCAP(ScanFiles):
     ) -> None:
         self._reflectance_max = check_scale(reflectance_max)
         root = Path(root)
-        base, paths = scan_paths(root, (SUFFIX,))
-        self._places: list[MessagePlace] = []
-        self._said: dict[Path, Description | None] = {}
-        ids = []
-        for path in paths:
-            places, self._said[path] = _survey(path, topic)
-            name = path.relative_to(base).with_suffix("").as_posix()
-            numbers = range(len(places))
-            ids += [name] if len(places) == 1 else [f"{name}/{n:06d}" for n in numbers]
-            self._places += places
-        said = self._said[paths[0]]
+        topics: set[str] = set()
+        ids, self._places, self._said = find_scans(
+            root, SUFFIX, lambda path: _survey(path, topic, topics), _in_order
+        )
+        if topic not in topics and len(topics) > (topic is None):
+            raise ConfigError(
+                f"{root} has point clouds on {', '.join(sorted(topics))}",
+                topic or "one topic",
+                "--topic NAME (topic=...) reads one of them.",
+            )
+        said = next(iter(self._said.values()))
         stored = said.sensor if said else None
         super().__init__(root, ids, sensor, on_bad, stored=stored)
         if topic is not None:
@@ -124,12 +124,12 @@ class MCAP(ScanFiles):
         return {"reflectance_max": self._reflectance_max} | self._chosen
 
     def read(self, index: int) -> Scan:
-        place = self._places[index]
-        said = self._said[place.path]
+        path, place = self._places[index]
+        said = self._said[path]
         sensor = self._given or (said and said.sensor) or self.sensor
-        arrays = _points(_message(place), f"{place.path}: {self.ids[index]}")
+        arrays = _points(_message(path, place), f"{path}: {self.ids[index]}")
         most = self._reflectance_max
-        scan = as_scan(arrays, said, sensor, place.path, most, not self._unknown)
+        scan = as_scan(arrays, said, sensor, path, most, not self._unknown)
         scan.id = self.ids[index]
         return scan
 
@@ -172,10 +172,17 @@ class MCAPWriter(PCDWriter):
     encode = staticmethod(encode_mcap)
 
 
+def _in_order(path: Path) -> list[Any]:
+    """A key that sorts the files of a split record by their numbers: bag_2 before bag_10."""
+    parts = [re.split(r"(\d+)", part) for part in path.parts]
+    return [[int(t) if t.isdecimal() else t for t in part] for part in parts]
+
+
 def _survey(
-    path: Path, topic: str | None
+    path: Path, topic: str | None, topics: set[str]
 ) -> tuple[list[MessagePlace], Description | None]:
-    """The point clouds of a file in the order of their times, and what it says about them."""
+    """The point clouds of a file on a topic, or on all, in the order of their times, and what it
+    says about them. Its topics are added to ``topics``."""
     with _opened(path) as (file, reader):
         summary = reader.get_summary()
         if summary is None or (summary.channels and not summary.chunk_indexes):
@@ -184,23 +191,17 @@ def _survey(
                 "a file that was closed",
                 f"mcap recover {path} makes one.",
             )
-        topics = {
+        clouds = {
             number: channel.topic
             for number, channel in summary.channels.items()
             if summary.schemas[channel.schema_id].name == MESSAGE
-            and topic in (None, channel.topic)
         }
-        if len(set(topics.values())) > 1:
-            raise ConfigError(
-                f"{path} has point clouds on {', '.join(sorted(topics.values()))}",
-                "one topic",
-                "lidar_synth.formats.MCAP(..., topic=...) reads one of them.",
-            )
+        topics.update(clouds.values())
         found = [
-            (time, MessagePlace(path, chunk.chunk_start_offset, offset))
+            (time, MessagePlace(chunk.chunk_start_offset, offset))
             for chunk in summary.chunk_indexes
             for number, start in chunk.message_index_offsets.items()
-            if number in topics
+            if number in clouds and topic in (None, clouds[number])
             for time, offset in _index(file, start)
         ]
         said = _description(reader, str(path))
@@ -217,9 +218,9 @@ def _index(file: BinaryIO, start: int) -> list[tuple[int, int]]:
     return records
 
 
-def _message(place: MessagePlace) -> Any:
+def _message(path: Path, place: MessagePlace) -> Any:
     """A decoded message."""
-    with _opened(place.path) as (file, _):
+    with _opened(path) as (file, _):
         from mcap.data_stream import ReadDataStream
         from mcap.records import Message, Schema
         from mcap_ros2.decoder import DecoderFactory

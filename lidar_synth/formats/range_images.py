@@ -109,15 +109,11 @@ class RangeImages(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
-        self._base, paths = scan_paths(root, SUFFIXES)
-        ids = [
-            path.relative_to(self._base).with_suffix("").as_posix() for path in paths
-        ]
-        stored = read_stored_sensor(paths[0])
+        ids, self._paths = scan_paths(root, SUFFIXES)
+        stored = read_stored_sensor(self._paths[0])
         super().__init__(
             root, ids, sensor if stored is None else None, on_bad, stored=stored
         )
-        self._suffix = paths[0].suffix
         self._given = None if sensor is None else load_sensor(sensor)
         if convention is None:
             of_sensor = {c.sensor: name for name, c in CONVENTIONS.items()}
@@ -148,17 +144,14 @@ class RangeImages(ScanFiles):
         for name, value in facts.items():
             setattr(scan, name, value)
         scan.id = self.ids[index]
-        check_scan(scan, str(self._path(index)))
+        check_scan(scan, str(self._paths[index]))
         return scan
-
-    def _path(self, index: int) -> Path:
-        return self._base / f"{self.ids[index]}{self._suffix}"
 
     def _decode(
         self, index: int
     ) -> tuple[RangeImage, dict[str, Any], NDArray[np.float32] | None]:
         """The image, further facts of the scan, and (H, W, 3) points if the file holds them."""
-        path = self._path(index)
+        path = self._paths[index]
         arrays = read_arrays(path)
         if "range" in arrays:
             sensor = self._given if "sensor" in arrays else self._named
