@@ -11,6 +11,7 @@ from logs import LOGS, axes, turn_time, write_log
 from test_fit_sensor import run
 
 from lidar_synth import MixedScans, load_sensor, open_scans
+from lidar_synth.errors import DataError
 from lidar_synth.formats.folder import rows_of_rings
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.town import Town
@@ -137,6 +138,65 @@ def test_times_are_read_in_any_unit(
     write_log(tmp_path / "a.pcd", {**axes(scan), "i": scan.reflectance, name: given})
     read = open_scans(tmp_path, sensor=scan.sensor)[0].time
     assert read is not None and np.allclose(read, time, atol=1.1 / max(unit, 1000))
+
+
+@pytest.mark.parametrize("empty", [0.0, np.nan])
+def test_firings_without_a_return_are_dropped_and_their_times_do_not_count(
+    tmp_path: Path, empty: float
+) -> None:
+    scan = rays(8)
+    lost = np.arange(len(scan)) % 5 == 0
+    points = np.where(lost[:, None], np.float32(empty), scan.points)
+    time = 1.7e9 + np.linspace(0, 0.1, len(scan))
+    columns = axes(replace(scan, points=points)) | {"i": scan.reflectance}
+    columns |= {"ring": scan.ring, "timestamp": np.where(lost, empty, time)}
+    write_log(tmp_path / "a.pcd", columns)
+    read = open_scans(tmp_path, sensor=scan.sensor)[0]
+    assert np.array_equal(read.points, scan.points[~lost])
+    since = time[~lost] - time[~lost].min()
+    assert read.time is not None and np.allclose(read.time, since, atol=1e-6)
+
+
+def test_times_of_bad_points_do_not_count(tmp_path: Path) -> None:
+    scan = rays(8)
+    bad = np.arange(len(scan)) == 7
+    columns = axes(scan) | {"x": np.where(bad, np.float32(np.nan), scan.points[:, 0])}
+    time = np.where(bad, 0, 1.7e9 + np.linspace(0, 0.1, len(scan)))
+    fields = {"i": scan.reflectance, "ring": scan.ring, "timestamp": time}
+    write_log(tmp_path / "a.pcd", columns | fields)
+    with pytest.raises(DataError, match="1 of 1024 points are NaN"):
+        open_scans(tmp_path, sensor=scan.sensor)[0]
+    read = open_scans(tmp_path, sensor=scan.sensor, on_bad="drop-points")[0]
+    assert read.time is not None and read.time.max() == pytest.approx(0.1)
+
+
+def test_rings_may_be_whole_floats(tmp_path: Path) -> None:
+    scan = rays(8)
+    fields = {"i": scan.reflectance, "ring": scan.ring.astype(np.float32)}
+    write_log(tmp_path / "a.pcd", axes(scan) | fields)
+    read = open_scans(tmp_path, sensor=scan.sensor)[0]
+    assert read.ring is not None and read.ring.dtype == np.int16
+    assert np.array_equal(read.ring, scan.ring)
+
+
+def test_fields_that_are_not_understood_are_reported(tmp_path: Path) -> None:
+    scan = rays(8)
+    ring = np.where(np.arange(len(scan)) == 3, 65535, scan.ring).astype(np.uint16)
+    fields = {"i": 255 * scan.reflectance, "ring": ring, "t": 1e7 * np.arange(1024)}
+    write_log(tmp_path / "a.pcd", axes(scan) | fields)
+    source = open_scans(tmp_path, sensor=scan.sensor, reflectance_max=255)
+    with (
+        pytest.warns(UserWarning, match=r"rings .* are ignored: some are no whole"),
+        pytest.warns(UserWarning, match=r"times .* are ignored: in no unit"),
+    ):
+        assert list(source[0].fields()) == ["reflectance"]
+    with (
+        pytest.warns(UserWarning, match=r"rings .* are ignored"),
+        pytest.raises(DataError, match="its reflectance runs from") as error,
+    ):
+        open_scans(tmp_path, sensor=scan.sensor)[0]
+    assert "--reflectance-max 255" in str(error.value)
+    assert "--fields" not in str(error.value)
 
 
 def test_labels_of_other_programs_are_not_taken_for_classes(tmp_path: Path) -> None:

@@ -5,14 +5,15 @@ Reflectance is stored in the field ``intensity``, which other tools understand; 
 a scan keep their names. ``raw_label`` is stored bit for bit as a signed integer, because not every
 PLY reader supports unsigned 32-bit values.
 
-The logs of drivers have other names and types, which are read too: ``ring`` or ``channel`` of any
-integers, the time as ``time``, ``t``, ``time_stamp`` or ``timestamp`` in any unit of ``UNITS``, and
+The logs of drivers have other names and types, which are read too: ``ring`` or ``channel`` of whole
+numbers, the time as ``time``, ``t``, ``time_stamp`` or ``timestamp`` in any unit of ``UNITS``, and
 Ouster's ``reflectivity``, which is calibrated and takes precedence over its ``intensity``, the
 number of photons. Names of the reflectance may have capitals, and CloudCompare's prefix
 ``scalar_``.
 """
 
 import io
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -129,10 +130,9 @@ def check_fields(fields: Sequence[Field], count: int, where: str) -> None:
         DataError: if x, y or z is missing, a wanted field occurs twice or has several values per
             point, a point has more than ``WIDEST`` bytes, or there are no points.
     """
-    names = [field.name for field in fields if field.wanted]
-    if len(set(names)) < len(names) or any(
-        field.count != 1 for field in fields if field.wanted
-    ):
+    wanted = [field for field in fields if field.wanted]
+    names = [field.name for field in wanted]
+    if len(set(names)) < len(names) or any(field.count != 1 for field in wanted):
         raise DataError(
             f"{where} has the fields {names} twice or with several values",
             "one value of each",
@@ -236,7 +236,8 @@ def _typed(values: NDArray[np.float64], field: Field, where: str) -> NDArray[Any
 
 
 def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Rename and convert a file's fields to those of a ``Scan``, as far as it has them.
+    """Rename and convert a file's fields to those of a ``Scan``, as far as it has them: ring and
+    time as they are stored, see ``CloudFiles``.
 
     Labels and the like are read only if they have the type of ``STORED``; other programs use the
     names otherwise.
@@ -253,17 +254,8 @@ def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     arrays = {"points": points, **reflectance} | {
         n: stored[n].astype(TYPES[n]) for n in own
     }
-    ring = _first(stored, RINGS)
-    time = _first(stored, TIMES)
-    if (
-        ring is not None
-        and ring.dtype.kind in "iu"
-        and 0 <= ring.min() <= ring.max() < 1 << 15
-    ):
-        arrays["ring"] = ring.astype(np.int16)
-    if time is not None and "time" not in arrays:
-        arrays |= seconds(time)
-    return arrays
+    named = {"ring": _first(stored, RINGS), "time": _first(stored, TIMES)}
+    return arrays | {n: values for n, values in named.items() if values is not None}
 
 
 def _first(
@@ -273,16 +265,28 @@ def _first(
     return next((stored[name] for name in names if name in stored), None)
 
 
-def seconds(time: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """``time`` as seconds from the first point, read in the largest unit in which a turn is short.
+def seconds(scan: Scan, where: Path) -> NDArray[np.float32] | None:
+    """The times of a scan as seconds from the first point, read in the largest unit in which a turn
+    is short; points that are not finite do not count.
 
-    Nothing if there is no such unit, or all points have one time: that is the time of the file.
+    None if all points have one time, which is that of the file; with a warning, which names
+    ``where``, if there is no such unit.
     """
-    if not np.isfinite(time).all() or time.min() == time.max():
-        return {}
-    since = (time - time.min()).astype(np.float64)
-    unit = next((unit for unit in UNITS if since.max() * unit <= LONGEST_TURN), None)
-    return {} if unit is None else {"time": (since * unit).astype(np.float32)}
+    assert scan.time is not None
+    own = scan.time[np.isfinite(scan.points).all(axis=1)]
+    if not own.size or own.min() == own.max():
+        return None
+    with np.errstate(all="ignore"):
+        since: NDArray[np.float64] = (scan.time - own.min()).astype(np.float64)
+        longest = np.float64(own.max() - own.min())
+        for unit in UNITS:
+            if longest * unit <= LONGEST_TURN:
+                return (since * unit).astype(np.float32)
+    warnings.warn(
+        f"the times of the points in {where} are ignored: in no unit is a turn short",
+        stacklevel=3,
+    )
+    return None
 
 
 def to_records(scan: Scan) -> NDArray[np.void]:

@@ -27,7 +27,11 @@ from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import files_below, read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_arrays
-from lidar_synth.formats.cloud import REFLECTANCES, read_header_description, seconds
+from lidar_synth.formats.cloud import (
+    REFLECTANCES,
+    read_header_description,
+    seconds,
+)
 from lidar_synth.formats.description import Description
 from lidar_synth.formats.npz import (
     check_numbers,
@@ -63,7 +67,69 @@ MOST_OFF = 5.0
 """Degrees between rings and beams (median) beyond which elevations do not tell the rings' rows."""
 
 
-class Folder(ScanFiles):
+class CloudFiles(ScanFiles):
+    """Files of points with named fields, which this package or others wrote."""
+
+    plain = True
+
+    def as_scan(
+        self, arrays: dict[str, Any], said: Description | None, path: Path
+    ) -> Scan:
+        """The checked scan of a cloud, with reflectance from 0 to 1, the sensor's rings, and the
+        boxes beside its file.
+
+        Args:
+            arrays: as the file has them.
+            said: what this package wrote about it; other clouds with rings are logs of drivers.
+            path: of the file.
+
+        Raises:
+            DataError: on a scan with invalid values, or damaged boxes.
+            FileError: if the boxes cannot be read.
+        """
+        if "reflectance" not in arrays:
+            warnings.warn(
+                f"the points in {path.parent} have no reflectance (no field "
+                f"{', '.join(REFLECTANCES)}): it is read as 0",
+                stacklevel=2,
+            )
+            arrays["reflectance"] = np.zeros(len(arrays["points"]), np.float32)
+        if said is None:
+            arrays = {name: a for name, a in arrays.items() if name not in _OURS}
+        sensor = self._given or (said and said.sensor) or self.sensor
+        scan = Scan(sensor=sensor, **arrays)
+        scan = drop_empty_firings(scan) if said is None else said.origin.apply(scan)
+        if (ring := scan.ring) is not None:
+            with np.errstate(invalid="ignore"):
+                scan.ring = ring.astype(np.int16)
+            lowest = 0 if said is None else ring.min()
+            if not np.array_equal(scan.ring.clip(lowest), ring):
+                scan.ring = None
+                warnings.warn(
+                    f"the rings of the points in {path.parent} are ignored: some are no whole "
+                    "numbers from 0 to 32767",
+                    stacklevel=2,
+                )
+        if scan.time is not None and said is None:
+            scan.time = seconds(scan, path.parent)
+        scan.boxes = read_boxes(path)
+        is_log = said is None and scan.ring is not None
+        scale = self._reflectance_max or 1.0
+        if (
+            is_log
+            and self._reflectance_max is None
+            and np.nanmax(scan.reflectance, initial=0) > 1
+        ):
+            scale = LOG_REFLECTANCE
+        check_scan(scan, str(path), scale)
+        if is_log and not self._unknown:
+            scan.ring = rows_of_rings(scan)
+        if scale != 1:
+            scan.reflectance = scan.reflectance / np.float32(scale)
+        return scan
+
+
+class Folder(CloudFiles):
     """A folder of .bin, .npy, .npz, .pcd or .ply files, one kind only, or one such file.
 
     Args:
@@ -86,8 +152,6 @@ class Folder(ScanFiles):
             ``reflectance_max``.
         DataError: if there is no file.
     """
-
-    plain = True
 
     @classmethod
     def recognises(cls, root: Path) -> bool:
@@ -143,58 +207,7 @@ class Folder(ScanFiles):
             scan.reflectance = scan.reflectance / np.float32(most or 1)
             return scan
         arrays = ARRAYS[suffix](path)
-        said = read_header_description(path)
-        sensor = self._given or (said and said.sensor) or self.sensor
-        return as_scan(arrays, said, sensor, path, most, not self._unknown)
-
-
-def as_scan(
-    arrays: dict[str, Any],
-    said: Description | None,
-    sensor: Sensor,
-    path: Path,
-    most: float | None,
-    known: bool,
-) -> Scan:
-    """The checked scan of a cloud, with reflectance from 0 to 1, the sensor's rings, and the boxes
-    beside its file.
-
-    Args:
-        arrays: as the file has them.
-        said: what this package wrote about it; other clouds with rings are logs of drivers.
-        sensor: of the scan.
-        path: of the file.
-        most: maximum of the reflectance in the file, if it is known.
-        known: whether the sensor is known, so that rings become its rows.
-
-    Raises:
-        DataError: on a scan with invalid values, or damaged boxes.
-        FileError: if the boxes cannot be read.
-    """
-    if "reflectance" not in arrays:
-        warnings.warn(
-            f"the points in {path.parent} have no reflectance (no field "
-            f"{', '.join(REFLECTANCES)}): it is read as 0",
-            stacklevel=2,
-        )
-        arrays["reflectance"] = np.zeros(len(arrays["points"]), np.float32)
-    if said is None:
-        arrays = {name: a for name, a in arrays.items() if name not in _OURS}
-        if "time" in arrays:
-            arrays |= seconds(arrays.pop("time"))
-    scan = Scan(sensor=sensor, **arrays)
-    scan = drop_empty_firings(scan) if said is None else said.origin.apply(scan)
-    scan.boxes = read_boxes(path)
-    is_log = said is None and scan.ring is not None
-    scale = most or 1.0
-    if is_log and most is None and np.nanmax(scan.reflectance, initial=0) > 1:
-        scale = LOG_REFLECTANCE
-    check_scan(scan, str(path), scale)
-    if is_log and known:
-        scan.ring = rows_of_rings(scan)
-    if scale != 1:
-        scan.reflectance = scan.reflectance / np.float32(scale)
-    return scan
+        return self.as_scan(arrays, read_header_description(path), path)
 
 
 def read_boxes(path: Path) -> Boxes | None:
@@ -235,8 +248,11 @@ def boxes_as_lists(boxes: Boxes) -> dict[str, list[Any]]:
 
 
 def drop_empty_firings(scan: Scan) -> Scan:
-    """The scan without points at the origin, as drivers write firings that had no return."""
+    """The scan without firings that had no return: points at the origin, and those of logs without
+    any coordinate."""
     there = scan.points.any(axis=1)
+    if scan.ring is not None and scan.time is not None:
+        there &= ~np.isnan(scan.points).all(axis=1)
     return scan if there.all() else scan[there]
 
 

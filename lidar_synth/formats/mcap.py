@@ -21,9 +21,9 @@ from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthE
 from lidar_synth.files.disk import open_file
 from lidar_synth.formats.cloud import Field, check_fields, to_arrays, to_records
 from lidar_synth.formats.description import Description, from_comments, to_comments
-from lidar_synth.formats.folder import PCDWriter, as_scan, find_scans, has_files
+from lidar_synth.formats.folder import CloudFiles, PCDWriter, find_scans, has_files
 from lidar_synth.formats.points import check_scale
-from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.formats.source import OnBad
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -66,7 +66,7 @@ class MessagePlace(NamedTuple):
     offset: int
 
 
-class MCAP(ScanFiles):
+class MCAP(CloudFiles):
     """A folder of .mcap files with PointCloud2 messages of ROS 2, or one such file.
 
     Args:
@@ -84,8 +84,6 @@ class MCAP(ScanFiles):
         DataError: if there is no scan, or a file is damaged or has no index.
         LibraryError: without the extra ``mcap``.
     """
-
-    plain = True
 
     @classmethod
     def recognises(cls, root: Path) -> bool:
@@ -125,11 +123,8 @@ class MCAP(ScanFiles):
 
     def read(self, index: int) -> Scan:
         path, place = self._places[index]
-        said = self._said[path]
-        sensor = self._given or (said and said.sensor) or self.sensor
         arrays = _points(_message(path, place), f"{path}: {self.ids[index]}")
-        most = self._reflectance_max
-        scan = as_scan(arrays, said, sensor, path, most, not self._unknown)
+        scan = self.as_scan(arrays, self._said[path], path)
         scan.id = self.ids[index]
         return scan
 
@@ -280,8 +275,8 @@ def _points(message: Any, where: str) -> dict[str, NDArray[Any]]:
         )
     names = [field.name for field in fields]
     types = [field.type for field in fields]
-    layout: Any = {"names": names, "formats": types, "itemsize": message.point_step}
-    layout["offsets"] = offsets
+    layout: Any = {"names": names, "formats": types, "offsets": offsets}
+    layout["itemsize"] = message.point_step
     data = np.frombuffer(message.data, np.uint8, message.row_step * message.height)
     rows = data.reshape(message.height, message.row_step)[:, :row]
     points = np.frombuffer(rows.tobytes(), np.dtype(layout))

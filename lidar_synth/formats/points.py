@@ -22,6 +22,11 @@ LONGEST = 60.0
 
 _FOR_ALL = ", or the largest value of all scans: all are divided by it"
 
+_FOURTH = " (the fourth value of a point)"
+_FIELDS = (
+    ", or another number of floats per point (--fields 5, fields=5; nuScenes has 5)"
+)
+
 _bad_points_kept = ContextVar("bad points kept", default=False)
 
 
@@ -130,12 +135,13 @@ def check_points(
         _find_bad_value(points, reflectance, where)
     scale = 255 if high <= 255 else int(np.ceil(high))
     if not 0 <= low <= high <= reflectance_max:
+        plain = where.endswith((".bin", ".npy"))
         raise DataError(
-            f"{where}: its reflectance (the fourth value of a point) runs from {low:g} to {high:g}",
+            f"{where}: its reflectance{_FOURTH * plain} runs from {low:g} to {high:g}",
             f"values in [0, {reflectance_max:g}]",
             f"Either it holds intensities on another scale (--reflectance-max {scale}, in Python "
-            f"reflectance_max={scale}{_FOR_ALL if scale > 255 else ''}), or another number of "
-            "floats per point (--fields 5, fields=5; nuScenes has 5), or it is damaged.",
+            f"reflectance_max={scale}{_FOR_ALL if scale > 255 else ''}){_FIELDS * plain}, or it is "
+            "damaged.",
         )
 
 
