@@ -145,6 +145,38 @@ def copy_logs(root: Path) -> list[Path]:
     return sorted(root.rglob("lidar.*.arrow"))
 
 
+def split_sensors(root: Path) -> None:
+    """Gives each sensor of the logs a file of its own, with all points of the merged one."""
+    import msgpack
+    import pyarrow as pa
+
+    for sync in root.rglob("sync.arrow"):
+        merged = sync.parent / "lidar.lidar_merged.arrow"
+        points = pa.ipc.open_file(merged.read_bytes()).read_all()
+        facts = msgpack.unpackb(
+            points.schema.metadata[b"metadata"], strict_map_key=False
+        )
+        rows = pa.ipc.open_file(sync.read_bytes()).read_all()
+        names = rows.column_names
+        place = names.index("lidar.lidar_merged")
+        for number, mount in facts.items():
+            name = f"lidar.sensor_{number}"
+            packed = {b"metadata": msgpack.packb({"lidar_id": int(number), **mount})}
+            _write(
+                sync.parent / f"{name}.arrow", points.replace_schema_metadata(packed)
+            )
+            rows = rows.append_column(name, rows.column(place))
+        _write(sync, rows.remove_column(place))
+        merged.unlink()
+
+
+def _write(path: Path, table: Any) -> None:
+    import pyarrow as pa
+
+    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_file(file, table.schema) as out:
+        out.write_table(table)
+
+
 if __name__ == "__main__":
     shutil.rmtree(GOLDEN, ignore_errors=True)
     write_logs(GOLDEN, town_scans())

@@ -15,6 +15,7 @@ from py123d_files import (
     grey,
     in_vehicle,
     in_world,
+    split_sensors,
     town_scans,
     write_logs,
 )
@@ -127,6 +128,22 @@ def test_another_sensor_of_the_log(tmp_path: Path) -> None:
     absent = READERS["py123d"](tmp_path, lidar=6)  # type: ignore[call-arg]
     with pytest.raises(DataError, match=r"has no sensor 6; expected one of \[2, 3\]"):
         absent[0]
+
+
+def test_a_sensor_of_a_log_with_a_file_for_each(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    copy_logs(tmp_path)
+    reader: Any = READERS["py123d"]
+    places = {}
+    for number in (2, 3):
+        merged = reader(tmp_path, lidar=number)
+        places[number] = merged.read(0).pose
+    split_sensors(tmp_path)
+    for number in (2, 3):
+        own = reader(tmp_path, lidar=number)
+        assert np.array_equal(own.read(0).pose, places[number])
+    with pytest.raises(DataError, match="has no sensor 0"):
+        reader(tmp_path, lidar=0).read(0)
 
 
 @pytest.mark.parametrize("keep", [0, 100, -200])

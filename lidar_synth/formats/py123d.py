@@ -12,7 +12,7 @@ quarters of a circle so that x is ahead, and those of nuScenes without points ne
 (``nuscenes.NEAREST``). The package reads this layout and does not write it.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -123,7 +123,7 @@ class Py123D(ScanFiles):
                 name = facts["split"]
                 splits.add(name)
                 if split in (None, name, name.rpartition("_")[2]):
-                    found = _frames(path.parent, facts["dataset"], table)
+                    found = _frames(path.parent, facts["dataset"], table, lidar)
                     ids += [f"{name}/{facts['log_name']}/{n:06d}" for n, _ in found]
                     self._frames += [frame for _, frame in found]
         if split is not None and not ids:
@@ -149,20 +149,17 @@ class Py123D(ScanFiles):
         frame = self._frames[index]
         path = frame.folder / f"{frame.lidar}.arrow"
         row, facts = _row(frame, frame.lidar)
-        merged = frame.lidar == MERGED
-        mounts = (
-            {int(number): mount for number, mount in facts.items()}
-            if merged
-            else {facts["lidar_id"]: facts}
-        )
-        number = self._lidar or (TOP if TOP in mounts else min(mounts))
+        mounts = _mounts(facts)
+        number = self._lidar
+        if number is None:
+            number = TOP if TOP in mounts else min(mounts)
         if number not in mounts:
             raise DataError(
                 f"{path} has no sensor {number}", f"one of {sorted(mounts)}"
             )
         with _errors(path):
             cloud = _cloud(row, frame, facts)
-            if merged and "ids" in cloud:
+            if frame.lidar == MERGED and "ids" in cloud:
                 own = cloud["ids"] == number
                 cloud = {name: values[own] for name, values in cloud.items()}
             mount = _ahead(_transform(mounts[number]["lidar_to_imu_se3"]))
@@ -193,13 +190,30 @@ class Py123D(ScanFiles):
         return drop_nearest(scan, path) if frame.dataset == "nuscenes" else scan
 
 
-def _frames(folder: Path, dataset: str, table: Any) -> list[tuple[int, Frame]]:
-    """The frames of a log with clouds, with their numbers."""
+def _mounts(facts: dict[Any, Any]) -> dict[int, dict[str, Any]]:
+    """The sensors of a file of clouds by their numbers: of a merged one, or of one sensor."""
+    if "lidar_id" in facts:
+        return {facts["lidar_id"]: facts}
+    return {int(number): mount for number, mount in facts.items()}
+
+
+def _numbers(path: Path) -> Iterable[int]:
+    """The numbers of the sensors of a file of clouds."""
+    with _opened(path) as table:
+        return _mounts(_facts(table))
+
+
+def _frames(
+    folder: Path, dataset: str, table: Any, lidar: int | None
+) -> list[tuple[int, Frame]]:
+    """The frames of a log with clouds of a sensor, with their numbers."""
     columns = table.read_all().to_pydict()
     clouds = sorted(name for name in columns if name.startswith("lidar."))
     clouds.sort(key=lambda name: name not in (MERGED, "lidar.lidar_top"))
     if not clouds:
         return []
+    if lidar is not None:
+        clouds.sort(key=lambda name: lidar not in _numbers(folder / f"{name}.arrow"))
     numbers = enumerate(columns[clouds[0]])
     return [
         (n, Frame(folder, dataset, clouds[0], {k: v[n] for k, v in columns.items()}))
