@@ -370,3 +370,14 @@ def test_a_range_image_in_another_unit(tmp_path: Path, unit: int) -> None:
     np.save(tmp_path / "image.npy", distance.astype(np.uint16))
     with pytest.raises(DataError, match="exceed the 80 m of 'hdl64e_kitti'.*unit"):
         open_scans(tmp_path / "image.npy", sensor="hdl64e_kitti")[0]
+
+
+def test_points_with_many_columns_are_no_image(tmp_path: Path) -> None:
+    scan = some_scan()
+    points = np.column_stack([scan.points, scan.reflectance, *[scan.reflectance] * 60])
+    np.save(tmp_path / "a.npy", points[:, :9])
+    assert np.array_equal(open_scans(tmp_path)[0].points, scan.points)
+    np.save(tmp_path / "a.npy", points)
+    with pytest.raises(DataError, match=r"\(566, 64\); expected .*--layout folder"):
+        open_scans(tmp_path)[0]
+    assert len(open_scans(tmp_path, layout="folder")[0]) == len(scan)

@@ -39,6 +39,9 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 SUFFIXES = (".npz", ".npy")
 
+NARROWEST = 64
+"""Columns from which a two-dimensional array is taken for an image, and not for a list of points."""
+
 
 @dataclass(frozen=True)
 class Convention:
@@ -97,7 +100,7 @@ class RangeImages(ScanFiles):
             return False
         if "array" in arrays:
             shape = arrays["array"].shape
-            return len(shape) == 3 or (len(shape) == 2 and shape[1] > 8)
+            return len(shape) == 3 or (len(shape) == 2 and shape[1] >= NARROWEST)
         return "range" in arrays or "image" in arrays
 
     def __init__(
@@ -167,19 +170,16 @@ class RangeImages(ScanFiles):
             array = array.astype(np.float32)
         if array.ndim == 3 and array.shape[2] == 6:
             return decode_stack(array, self._convention, self.sensor, str(path))
-        if array.ndim == 3 and len(array) != 2:
+        grid = self.sensor.shape
+        if array.shape not in (grid, (2, *grid)):
             raise DataError(
                 f"{path} holds an array of shape {array.shape}",
-                "(H, W), (2, H, W) or (H, W, 6)",
+                f"{grid}, {(2, *grid)} or {(*grid, 6)} for {self.sensor.name!r}",
+                "--layout folder (layout='folder') reads points.",
             )
-        channels = {"reflectance": array[1]} if array.ndim == 3 else {}
-        return (
-            range_image(
-                array[0] if array.ndim == 3 else array, self.sensor, channels, str(path)
-            ),
-            {},
-            None,
-        )
+        distance, *grey = array if array.ndim == 3 else [array]
+        channels = {"reflectance": values for values in grey}
+        return range_image(distance, self.sensor, channels, str(path)), {}, None
 
 
 def decode_stack(
