@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from copy import copy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -50,12 +49,8 @@ class CameraBoxes(ScanFiles):
         part = copy(self)
         part.ids = tuple(ids)
         part._cropped = True
+        part.options = self.options | {"cropped": True}
         return part
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """See ``ScanFiles.options``."""
-        return super().options | ({"cropped": True} if self._cropped else {})
 
     @abstractmethod
     def _has_boxes(self, name: str) -> bool:

@@ -140,11 +140,9 @@ def check_fields(fields: Sequence[Field], count: int, where: str) -> None:
         )
     if not {"x", "y", "z"} <= set(names):
         raise DataError(f"{where} has the fields {names}", "x, y and z among them")
-    if sum(field.width for field in fields) > WIDEST:
-        raise DataError(
-            f"{where} has {sum(field.width for field in fields)} bytes per point",
-            f"at most {WIDEST}",
-        )
+    width = sum(field.width for field in fields)
+    if width > WIDEST:
+        raise DataError(f"{where} has {width} bytes per point", f"at most {WIDEST}")
     if count == 0:
         raise DataError(f"{where} holds no points", "at least one point", SKIP_HINT)
 
@@ -170,18 +168,10 @@ def from_records(
 ) -> dict[str, NDArray[Any]]:
     """{name: (N,)} the wanted fields of points stored as consecutive records; ``body`` must be long
     enough."""
-    wanted = []
-    offset = 0
-    for field in fields:
-        if field.wanted:
-            wanted.append((field.name, field.type, offset))
-        offset += field.width
-    names, types, offsets = (list(column) for column in zip(*wanted, strict=True))
-    dtype = np.dtype(
-        {"names": names, "formats": types, "offsets": offsets, "itemsize": offset}
-    )
-    records = np.frombuffer(body, dtype, count)
-    return {name: records[name] for name in names}
+    kinds = [f.type if f.wanted else f"V{f.width}" for f in fields]
+    records = np.frombuffer(body, ",".join(kinds), count)
+    named = zip(fields, records.dtype.names or (), strict=True)
+    return {field.name: records[place] for field, place in named if field.wanted}
 
 
 def from_text(

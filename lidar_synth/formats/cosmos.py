@@ -83,8 +83,7 @@ class Cosmos(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
-        ids, self._places, self._said = find_scans(root, SUFFIX, _survey)
-        stored = _sensor(self._said[self._places[0][0]])
+        ids, self._places, self._said, stored = find_scans(root, SUFFIX, _survey)
         super().__init__(root, ids, sensor, on_bad, stored=stored)
         self.skip_sensor_check()  # the grid is the sensor's
 
@@ -95,9 +94,10 @@ class Cosmos(ScanFiles):
             DataError, FileError: if it cannot be read.
         """
         path, sweep = self._places[index]
+        said = self._said[path]
         with _opened(path) as file:
             distance, intensity, valid = file.get_slice(TENSOR)[:, sweep]
-        stored = _sensor(self._said[path])
+        stored = said.sensor if said else None
         sensor = self._given or stored or self.sensor
         if stored is not None and stored.shape != sensor.shape:
             raise DataError(
@@ -187,11 +187,6 @@ def _survey(path: Path) -> tuple[range, Description | None]:
         return range(shape[1]), Description.from_dict(parse_json(text, where))
     except ValueError as error:
         raise DataError(f"{where} is damaged ({error})", "an intact file") from error
-
-
-def _sensor(said: Description | None) -> Sensor | None:
-    """The sensor that a file names."""
-    return None if said is None else said.sensor
 
 
 @contextmanager

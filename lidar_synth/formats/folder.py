@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +49,6 @@ from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.projection.unfold import rows_by_elevation
 from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
-
-Place = TypeVar("Place")
 
 LOG_REFLECTANCE = 255.0
 """Maximum of the reflectance in the logs of Velodyne's, Hesai's and Ouster's drivers."""
@@ -96,14 +94,13 @@ class CloudFiles(ScanFiles):
             arrays["reflectance"] = np.zeros(len(arrays["points"]), np.float32)
         if said is None:
             arrays = {name: a for name, a in arrays.items() if name not in _OURS}
-        sensor = self._given or (said and said.sensor) or self.sensor
-        scan = Scan(sensor=sensor, **arrays)
+        arrays["sensor"] = self._given or (said and said.sensor) or self.sensor
+        scan = Scan(**arrays)
         scan = drop_empty_firings(scan) if said is None else said.origin.apply(scan)
         if (ring := scan.ring) is not None:
             with np.errstate(invalid="ignore"):
                 scan.ring = ring.astype(np.int16)
-            lowest = 0 if said is None else ring.min()
-            if not np.array_equal(scan.ring.clip(lowest), ring):
+            if not np.array_equal(scan.ring.clip(-32768 if said else 0), ring):
                 scan.ring = None
                 warnings.warn(
                     f"the rings of the points in {path.parent} are ignored: some are no whole "
@@ -114,13 +111,10 @@ class CloudFiles(ScanFiles):
             scan.time = seconds(scan, path.parent)
         scan.boxes = read_boxes(path)
         is_log = said is None and scan.ring is not None
-        scale = self._reflectance_max or 1.0
-        if (
-            is_log
-            and self._reflectance_max is None
-            and np.nanmax(scan.reflectance, initial=0) > 1
-        ):
-            scale = LOG_REFLECTANCE
+        scale = self._reflectance_max
+        if scale is None:
+            wide = is_log and np.nanmax(scan.reflectance, initial=0) > 1
+            scale = LOG_REFLECTANCE if wide else 1.0
         check_scan(scan, str(path), scale)
         if is_log and not self._unknown:
             scan.ring = rows_of_rings(scan)
@@ -175,11 +169,7 @@ class Folder(CloudFiles):
         super().__init__(
             root, ids, sensor, on_bad, stored=_named_sensor(self._paths[0])
         )
-        self._fields = fields
-
-    @property
-    def options(self) -> dict[str, Any]:
-        return {"fields": self._fields, "reflectance_max": self._reflectance_max}
+        self.options = {"fields": fields, "reflectance_max": self._reflectance_max}
 
     def read(self, index: int) -> Scan:
         scan = self._decode(self._paths[index])
@@ -190,7 +180,7 @@ class Folder(CloudFiles):
         suffix = path.suffix.lower()
         most = self._reflectance_max
         if suffix == ".bin":
-            points = read_points(path, self._fields, most)
+            points = read_points(path, self.options["fields"], most)
             beside = path.with_suffix(".label")
             labels = (
                 read_labels(beside, path, len(points), SEMANTIC_KITTI)
@@ -321,7 +311,7 @@ def _named_sensor(path: Path) -> Sensor | None:
         said = read_header_description(path)
     except (DataError, FileError):
         return None
-    return None if said is None else said.sensor
+    return said.sensor if said else None
 
 
 def has_files(root: Path, suffixes: tuple[str, ...]) -> bool:
@@ -355,13 +345,13 @@ def scan_paths(
         return [root.stem], [root]
     if not root.is_dir():
         raise FileError(f"{root} does not exist", "a file or a folder with scans")
-    found = (path for path in files_below(root) if path.suffix.lower() in suffixes)
-    shown = (
-        p
-        for p in found
-        if not any(part[0] == "." for part in p.relative_to(root).parts)
+    found = (
+        path
+        for path in files_below(root)
+        if path.suffix.lower() in suffixes
+        and not any(part[0] == "." for part in path.relative_to(root).parts)
     )
-    paths = sorted(shown, key=order)
+    paths = sorted(found, key=order)
     kinds = sorted({path.suffix.lower() for path in paths})
     if len(kinds) > 1:
         raise ConfigError(
@@ -379,11 +369,13 @@ def scan_paths(
 def find_scans(
     root: Path,
     suffix: str,
-    survey: Callable[[Path], tuple[Sequence[Place], Description | None]],
+    survey: Callable[[Path], tuple[Sequence[Any], Description | None]],
     order: Callable[[Path], Any] | None = None,
-) -> tuple[list[str], list[tuple[Path, Place]], dict[Path, Description | None]]:
-    """The scans of files that hold several each: their ids, their files and places in them, and
-    what each file says, of which the first counts.
+) -> tuple[
+    list[str], list[tuple[Path, Any]], dict[Path, Description | None], Sensor | None
+]:
+    """The scans of files that hold several each: their ids, their files and places in them, what
+    each file says, and the sensor that the first one names.
 
     Args:
         root, order: as for ``scan_paths``.
@@ -401,7 +393,8 @@ def find_scans(
         numbers = range(len(places))
         ids += [name] if len(places) == 1 else [f"{name}/{n:06d}" for n in numbers]
         found += [(path, place) for place in places]
-    return ids, found, said
+    first = next(iter(said.values()))
+    return ids, found, said, first.sensor if first else None
 
 
 class KITTIWriter(FileWriter):

@@ -155,7 +155,7 @@ class KITTI360(ScanFiles):
                 )
         super().__init__(home, ids, sensor, on_bad)
         if self._labels not in (home, found):
-            self._chosen["labels"] = str(self._labels.resolve())
+            self.options["labels"] = str(self._labels.resolve())
         self.root = Path(root)  # by which others open the same scans
         self._home = home
         self._camera = read_calibration(home)

@@ -15,7 +15,7 @@ Layout (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme):
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -123,6 +123,7 @@ class KITTIObject(CameraBoxes):
                 for path in list_files(folder, ".bin")
             ]
         super().__init__(root, ids, sensor, on_bad)
+        self.options["velodyne"] = self._velodyne
 
     @property
     def beyond_view(self) -> bool:
@@ -187,10 +188,6 @@ class KITTIObject(CameraBoxes):
             id=name,
         )
         return self._in_view(scan, index)
-
-    @property
-    def options(self) -> dict[str, Any]:
-        return {"velodyne": self._velodyne} | super().options
 
     def calibration(self, index: int) -> Calibration | None:
         name = self.ids[index]

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,14 +58,6 @@ _INDEX = 7
 # Operation codes of records, each of which is followed by a length of 8 bytes.
 
 
-class MessagePlace(NamedTuple):
-    """Where a message is: in the chunk at byte ``chunk`` of a file, ``offset`` bytes from the
-    beginning of the chunk's records."""
-
-    chunk: int
-    offset: int
-
-
 class MCAP(CloudFiles):
     """A folder of .mcap files with PointCloud2 messages of ROS 2, or one such file.
 
@@ -102,7 +94,7 @@ class MCAP(CloudFiles):
         self._reflectance_max = check_scale(reflectance_max)
         root = Path(root)
         topics: set[str] = set()
-        ids, self._places, self._said = find_scans(
+        ids, self._places, self._said, stored = find_scans(
             root, SUFFIX, lambda path: _survey(path, topic, topics), _in_order
         )
         if topic not in topics and len(topics) > (topic is None):
@@ -111,19 +103,14 @@ class MCAP(CloudFiles):
                 topic or "one topic",
                 "--topic NAME (topic=...) reads one of them.",
             )
-        said = next(iter(self._said.values()))
-        stored = said.sensor if said else None
         super().__init__(root, ids, sensor, on_bad, stored=stored)
+        self.options["reflectance_max"] = self._reflectance_max
         if topic is not None:
-            self._chosen["topic"] = topic
-
-    @property
-    def options(self) -> dict[str, Any]:
-        return {"reflectance_max": self._reflectance_max} | self._chosen
+            self.options["topic"] = topic
 
     def read(self, index: int) -> Scan:
         path, place = self._places[index]
-        arrays = _points(_message(path, place), f"{path}: {self.ids[index]}")
+        arrays = _points(_message(path, *place), f"{path}: {self.ids[index]}")
         scan = self.as_scan(arrays, self._said[path], path)
         scan.id = self.ids[index]
         return scan
@@ -167,17 +154,17 @@ class MCAPWriter(PCDWriter):
     encode = staticmethod(encode_mcap)
 
 
-def _in_order(path: Path) -> list[Any]:
+def _in_order(path: Path) -> list[str]:
     """A key that sorts the files of a split record by their numbers: bag_2 before bag_10."""
-    parts = [re.split(r"(\d+)", part) for part in path.parts]
-    return [[int(t) if t.isdecimal() else t for t in part] for part in parts]
+    return [re.sub(r"\d+", lambda n: n[0].zfill(20), part) for part in path.parts]
 
 
 def _survey(
     path: Path, topic: str | None, topics: set[str]
-) -> tuple[list[MessagePlace], Description | None]:
-    """The point clouds of a file on a topic, or on all, in the order of their times, and what it
-    says about them. Its topics are added to ``topics``."""
+) -> tuple[list[tuple[int, int]], Description | None]:
+    """The point clouds of a file on a topic, or on all, in the order of their times: the byte of
+    the chunk of each, and the offset in it. Also what the file says about them; its topics are
+    added to ``topics``."""
     with _opened(path) as (file, reader):
         summary = reader.get_summary()
         if summary is None or (summary.channels and not summary.chunk_indexes):
@@ -193,7 +180,7 @@ def _survey(
         }
         topics.update(clouds.values())
         found = [
-            (time, MessagePlace(chunk.chunk_start_offset, offset))
+            (time, (chunk.chunk_start_offset, offset))
             for chunk in summary.chunk_indexes
             for number, start in chunk.message_index_offsets.items()
             if number in clouds and topic in (None, clouds[number])
@@ -213,14 +200,14 @@ def _index(file: BinaryIO, start: int) -> list[tuple[int, int]]:
     return records
 
 
-def _message(path: Path, place: MessagePlace) -> Any:
+def _message(path: Path, chunk: int, offset: int) -> Any:
     """A decoded message."""
     with _opened(path) as (file, _):
         from mcap.data_stream import ReadDataStream
         from mcap.records import Message, Schema
         from mcap_ros2.decoder import DecoderFactory
 
-        content = _record(_unpack_chunk(file, place.chunk), place.offset, _MESSAGE)
+        content = _record(_unpack_chunk(file, chunk), offset, _MESSAGE)
         message = Message.read(ReadDataStream(BytesIO(content)), len(content))
         schema = Schema(1, DEFINITION.encode(), "ros2msg", MESSAGE)
         decode = DecoderFactory().decoder_for("cdr", schema)
@@ -259,13 +246,12 @@ def _points(message: Any, where: str) -> dict[str, NDArray[Any]]:
         for f in message.fields
         if f.datatype in TYPES
     ]
-    offsets = [offset for offset, field in given if field.wanted]
-    fields = [field for _, field in given if field.wanted]
+    given = [(at, field) for at, field in given if field.wanted]
+    fields = [field for _, field in given]
     check_fields(fields, count, where)
-    ends = [at + field.width for at, field in zip(offsets, fields, strict=True)]
     row = message.width * message.point_step
     if (
-        max(ends) > message.point_step
+        max(at + field.width for at, field in given) > message.point_step
         or row > message.row_step
         or message.row_step * message.height > len(message.data)
     ):
@@ -274,9 +260,9 @@ def _points(message: Any, where: str) -> dict[str, NDArray[Any]]:
             f"{message.height} rows of {message.row_step} bytes, with all fields",
         )
     names = [field.name for field in fields]
-    types = [field.type for field in fields]
-    layout: Any = {"names": names, "formats": types, "offsets": offsets}
-    layout["itemsize"] = message.point_step
+    layout: Any = {"names": names, "itemsize": message.point_step}
+    layout["formats"] = [field.type for field in fields]
+    layout["offsets"] = [at for at, _ in given]
     data = np.frombuffer(message.data, np.uint8, message.row_step * message.height)
     rows = data.reshape(message.height, message.row_step)[:, :row]
     points = np.frombuffer(rows.tobytes(), np.dtype(layout))
@@ -290,8 +276,8 @@ def _description(reader: Any, where: str) -> Description | None:
     """What a file of this package says about its scan; None for those of others."""
     for record in reader.iter_metadata():
         if record.name == METADATA:
-            text = record.metadata.get("description", "")
-            return from_comments(text.splitlines(), where)
+            lines = record.metadata.get("description", "").splitlines()
+            return from_comments(lines, where)
     return None
 
 

@@ -164,12 +164,14 @@ def decode_range_image(
     Raises:
         DataError: if range or sensor is missing, or a shape does not match the sensor.
     """
-    channels = {
-        n: a
-        for n, a in arrays.items()
-        if n not in ("range", *FACTS) and not n.startswith(BOX)
-    }
-    channels = to_stored(channels, where)
+    channels = to_stored(
+        {
+            n: a
+            for n, a in arrays.items()
+            if n not in ("range", *FACTS) and not n.startswith(BOX)
+        },
+        where,
+    )
     try:
         facts = _known(arrays, sensor)
         if sensor is not None and sensor.shape != facts["sensor"].shape:

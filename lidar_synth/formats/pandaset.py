@@ -143,9 +143,9 @@ class PandaSet(ScanFiles):
         self.camera = camera
         self.motion_compensated = motion_compensated
         if camera != CAMERAS[0]:
-            self._chosen["camera"] = camera
+            self.options["camera"] = camera
         if motion_compensated:
-            self._chosen["motion_compensated"] = True
+            self.options["motion_compensated"] = True
         self._device = int(self.sensor.name == FORWARD)
         self._mount = MOUNTS[FORWARD if self._device else "pandar64"]
         self._tracks: dict[Path, Track] = {}

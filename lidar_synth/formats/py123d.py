@@ -12,7 +12,7 @@ quarters of a circle so that x is ahead, and those of nuScenes without points ne
 (``nuscenes.NEAREST``). The package reads this layout and does not write it.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -113,7 +113,6 @@ class Py123D(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         root = Path(root)
-        self._lidar = lidar
         self._frames: list[Frame] = []
         ids = []
         splits = set()
@@ -139,18 +138,14 @@ class Py123D(ScanFiles):
         named = SENSORS.get(min(datasets, default=""), self.default_sensor)
         self.default_sensor = named  # type: ignore[misc]
         super().__init__(root, ids, sensor, on_bad)
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """See ``ScanFiles.options``."""
-        return {"lidar": self._lidar}
+        self.options["lidar"] = lidar
 
     def read(self, index: int) -> Scan:
         frame = self._frames[index]
         path = frame.folder / f"{frame.lidar}.arrow"
         row, facts = _row(frame, frame.lidar)
-        mounts = _mounts(facts)
-        number = self._lidar
+        mounts = _mounts(path)
+        number = self.options["lidar"]
         if number is None:
             number = TOP if TOP in mounts else min(mounts)
         if number not in mounts:
@@ -190,17 +185,13 @@ class Py123D(ScanFiles):
         return drop_nearest(scan, path) if frame.dataset == "nuscenes" else scan
 
 
-def _mounts(facts: dict[Any, Any]) -> dict[int, dict[str, Any]]:
+def _mounts(path: Path) -> dict[int, dict[str, Any]]:
     """The sensors of a file of clouds by their numbers: of a merged one, or of one sensor."""
+    with _opened(path) as table:
+        facts = _facts(table)
     if "lidar_id" in facts:
         return {facts["lidar_id"]: facts}
     return {int(number): mount for number, mount in facts.items()}
-
-
-def _numbers(path: Path) -> Iterable[int]:
-    """The numbers of the sensors of a file of clouds."""
-    with _opened(path) as table:
-        return _mounts(_facts(table))
 
 
 def _frames(
@@ -213,7 +204,7 @@ def _frames(
     if not clouds:
         return []
     if lidar is not None:
-        clouds.sort(key=lambda name: lidar not in _numbers(folder / f"{name}.arrow"))
+        clouds.sort(key=lambda name: lidar not in _mounts(folder / f"{name}.arrow"))
     numbers = enumerate(columns[clouds[0]])
     return [
         (n, Frame(folder, dataset, clouds[0], {k: v[n] for k, v in columns.items()}))

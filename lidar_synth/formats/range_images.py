@@ -40,7 +40,7 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor
 SUFFIXES = (".npz", ".npy")
 
 NARROWEST = 64
-"""Columns from which a two-dimensional array is taken for an image, and not for a list of points."""
+"""Number of columns from which an array (H, W) is taken for an image, and not for points."""
 
 
 @dataclass(frozen=True)
@@ -123,13 +123,10 @@ class RangeImages(ScanFiles):
             named = "" if self._named is None else self._named.name
             convention = of_sensor.get(named, "kitti")
         self._convention = choose("convention", convention, CONVENTIONS)
+        self.options = asdict(self._convention)
         if self._named is None:
             self.sensor = load_sensor(self._convention.sensor)
         self.skip_sensor_check()  # the grid is the sensor's: points on its rays agree with any
-
-    @property
-    def options(self) -> dict[str, Any]:
-        return asdict(self._convention)
 
     def image(self, index: int) -> RangeImage:
         """The range image at ``index``.
@@ -178,7 +175,7 @@ class RangeImages(ScanFiles):
                 "--layout folder (layout='folder') reads points.",
             )
         distance, *grey = array if array.ndim == 3 else [array]
-        channels = {"reflectance": values for values in grey}
+        channels = {"reflectance": grey[0]} if grey else {}
         return range_image(distance, self.sensor, channels, str(path)), {}, None
 
 

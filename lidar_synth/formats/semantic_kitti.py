@@ -135,7 +135,7 @@ class SemanticKITTI(ScanFiles):
         super().__init__(root, ids, sensor, on_bad)
         if taxonomy != SEMANTIC_KITTI:
             table = hash_of_names(map(str, sorted(taxonomy.to_train.items())))
-            self._chosen["taxonomy"] = [taxonomy.name, table]
+            self.options["taxonomy"] = [taxonomy.name, table]
         self._labelled = {s for s, f in folders.items() if (f / "labels").is_dir()}
         self._cameras = {s: read_calibration(f) for s, f in folders.items()}
         self._poses = {s: read_poses(f, self._cameras[s]) for s, f in folders.items()}

@@ -52,6 +52,8 @@ class ScanFiles(ABC):
             describes.
         description: what stands beside the files about all of their scans; None if there is
             nothing.
+        options: further options of the reader that determine its scans, as plain values; those
+            that are not chosen are missing, or have their default.
         skipped: {id: reason} of the scans that this process could not read.
         dropped: {id: number of points} that this process has dropped.
 
@@ -104,16 +106,12 @@ class ScanFiles(ABC):
         self._unchecked = named is None
         self._unknown = False
         self.on_bad = on_bad
-        self._chosen: dict[str, Any] = {}
+        scale = self._reflectance_max
+        self.options: dict[str, Any] = (
+            {} if scale is None else {"reflectance_max": scale}
+        )
         self.skipped: dict[str, str] = {}
         self.dropped: dict[str, int] = {}
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Further options of the reader that determine its scans, as plain values; those that are
-        not chosen are missing, or have their default."""
-        scale = self._reflectance_max
-        return self._chosen | ({} if scale is None else {"reflectance_max": scale})
 
     @abstractmethod
     def read(self, index: int) -> Scan:
