@@ -90,7 +90,7 @@ class _Prepared(DataLoaderShard):  # type: ignore[misc]
     """Accelerate's loader, which counts the batches that it has yielded: it fetches one ahead."""
 
     def __init__(self, made: Any, divided: MixedBatches | MixedStream) -> None:
-        vars(self).update(vars(made))
+        self.__dict__.update(made.__dict__)
         self._divided = divided
         mixed = divided.scans if isinstance(divided, MixedStream) else divided.dataset
         self._current = mixed.current
