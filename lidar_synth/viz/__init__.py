@@ -4,7 +4,7 @@
 needs a screen and OpenGL; nothing needs a network connection.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from lidar_synth.errors import ConfigError
@@ -37,35 +37,15 @@ __all__ = [
 ]
 
 
-def _write_png(
-    path: Path, given: Sequence[Scan | RangeImage], title: str, notes: str
-) -> None:
-    figure = sheet(given[0]) if len(given) == 1 else contact_sheet(given, title=title)
-    write_file(path, lambda file: figure.savefig(file, format="png"))
-
-
-def _write_html(
-    path: Path, given: Sequence[Scan | RangeImage], title: str, notes: str
-) -> None:
-    write_file(path, html_page(given, title=title, notes=notes).encode())
-
-
-_WRITERS: dict[str, Callable[[Path, Sequence[Scan | RangeImage], str, str], None]] = {
-    ".png": _write_png,
-    ".html": _write_html,
-}
-
-
 def view_suffix(path: Path) -> str:
     """The suffix of a path, if ``write_view`` can write such a file.
 
     Raises:
         ConfigError: on any other suffix than .png and .html.
     """
-    if path.suffix not in _WRITERS:
+    if path.suffix not in (".png", ".html"):
         raise ConfigError(
-            f"cannot write a view to {path}",
-            f"a file that ends in {' or '.join(_WRITERS)}",
+            f"cannot write a view to {path}", "a file that ends in .png or .html"
         )
     return path.suffix
 
@@ -100,4 +80,8 @@ def write_view(
     path = Path(path)
     if not given:
         raise ConfigError(f"no scans to write to {path}", "at least one scan")
-    _WRITERS[view_suffix(path)](path, given, title, notes)
+    if view_suffix(path) == ".html":
+        write_file(path, html_page(given, title=title, notes=notes).encode())
+        return
+    figure = sheet(given[0]) if len(given) == 1 else contact_sheet(given, title=title)
+    write_file(path, lambda file: figure.savefig(file, format="png"))
