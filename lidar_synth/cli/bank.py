@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_synth.cli.options import local_path
+from lidar_synth.cli.options import Json, local_path
 
 BankFolder = Annotated[
     str, typer.Argument(metavar="BANK", help="folder or URL of a bank")
@@ -106,10 +106,7 @@ def repair(bank: BankFolder, model: Model = None, condition: Condition = None) -
         typer.echo(f"{bank}: intact, nothing to do")
 
 
-def info(
-    bank: BankFolder,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
-) -> None:
+def info(bank: BankFolder, as_json: Json = False) -> None:
     """Describes a bank: scans, sensor, model, settings, licences.
 
     \b

@@ -121,13 +121,15 @@ def convert(
     change = _change(
         scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach
     )
-    how: dict[str, Any] = {
-        "jobs": jobs,
-        "on_bad": scans.on_bad,
-        "unfold": unfold,
-        "strict": strict,
-    }
-    report = run(scans, writer, as_sensor=change, **how)
+    report = run(
+        scans,
+        writer,
+        jobs=jobs,
+        on_bad=scans.on_bad,
+        as_sensor=change,
+        unfold=unfold,
+        strict=strict,
+    )
     print_report(report, out, to, as_sensor)
 
 
@@ -144,25 +146,22 @@ def print_report(
             f"  {100 * sum(report.seen) / len(report.seen):.0f} % of the field of view of "
             f"{as_sensor} was seen"
         )
-    for name, reason in report.skipped.items():
-        print(f"  skipped {name}: {reason}", file=sys.stderr)
-    for name, count in report.dropped.items():
-        print(
-            f"  dropped {count} points of {name}, which are NaN or infinite",
-            file=sys.stderr,
-        )
-    for name, count in report.lost.items():
-        print(
-            f"  dropped {name} of {count} scans, which {to} cannot hold",
-            file=sys.stderr,
-        )
+    notes = [f"skipped {name}: {reason}" for name, reason in report.skipped.items()]
+    notes += [
+        f"dropped {count} points of {name}, which are NaN or infinite"
+        for name, count in report.dropped.items()
+    ]
+    notes += [
+        f"dropped {name} of {count} scans, which {to} cannot hold"
+        for name, count in report.lost.items()
+    ]
     if report.unlabelled:
-        print(
-            f"  labels of {report.unlabelled} scans are unknown: written as 0, unlabelled",
-            file=sys.stderr,
+        notes.append(
+            f"labels of {report.unlabelled} scans are unknown: written as 0, unlabelled"
         )
-    for what in report.left_out:
-        print(f"  left out {what}", file=sys.stderr)
+    notes += [f"left out {what}" for what in report.left_out]
+    for note in notes:
+        print(f"  {note}", file=sys.stderr)
 
 
 def _change(

@@ -316,20 +316,13 @@ def _data() -> Iterator[Finding]:
             continue
         root = Path(value)
         first = next(iter(root.glob(pattern)), None)
-        if not root.is_dir():
+        if first is None:
+            wrong = f"holds no {pattern}" if root.is_dir() else "is not a folder"
             yield Finding(
                 "data",
                 variable,
                 "check",
-                f"{root} is not a folder",
-                fix=f"export {variable}=/the/folder",
-            )
-        elif first is None:
-            yield Finding(
-                "data",
-                variable,
-                "check",
-                f"{root} holds no {pattern}",
+                f"{root} {wrong}",
                 fix=f"export {variable}=/the/folder",
             )
         else:

@@ -1,14 +1,13 @@
 """``lidar-synth doctor``: checks this machine's libraries, devices and data."""
 
 import json
-from typing import Annotated
 
 import typer
 
+from lidar_synth.cli.options import Json
 
-def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
-) -> None:
+
+def doctor(as_json: Json = False) -> None:
     """Lists available and missing libraries, devices and data, and the command that installs what
     is missing.
 

@@ -40,6 +40,7 @@ Out = Annotated[
     typer.Argument(metavar="OUT", help="folder to write to", parser=local_path),
 ]
 Format = Annotated[str, typer.Option(help=FORMATS)]
+Json = Annotated[bool, typer.Option("--json", help="print JSON")]
 
 
 class Reading(BaseModel):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidar_synth.cli.bank import BankFolder
-from lidar_synth.cli.options import local_path
+from lidar_synth.cli.options import Json, local_path
 
 if TYPE_CHECKING:
     import numpy as np
@@ -57,7 +57,7 @@ def curate(
             parser=local_path,
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: Json = False,
     jobs: Annotated[int, typer.Option(min=1, help="number of worker processes")] = 1,
 ) -> None:
     """Scores every scan of a bank, lists the most unusual ones, and writes a bank without those

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidar_synth.cli.options import Json
+
 if TYPE_CHECKING:
     from lidar_synth.lab.evaluate.extractors import ExtractorSpec
 
@@ -29,7 +31,7 @@ def setup(
             help="folder of the weights; default: $LIDAR_SYNTH_METRICS",
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: Json = False,
 ) -> None:
     """Says which files the measures need, where to get them, and which are there and readable.
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lidar_synth.cli.options import Json
 from lidar_synth.errors import choose
 
 
@@ -16,7 +17,7 @@ def recipes(
         str | None,
         typer.Argument(metavar="[NAME]", help="print the file of this recipe"),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: Json = False,
     trainer: Annotated[
         str | None,
         typer.Option(

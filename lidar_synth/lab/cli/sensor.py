@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import Reading, drop_missing, options_from
+from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 
 if TYPE_CHECKING:
     from lidar_synth.lab.fitting import SensorFit
@@ -31,7 +31,7 @@ def fit_from_scans(
     picture: Annotated[
         Path | None, typer.Option(help="PNG file to write with a plot of the fit")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: Json = False,
     **reading: Any,
 ) -> None:
     """Fits a sensor to scans: elevation and azimuth offset of each beam, firings, range limits,

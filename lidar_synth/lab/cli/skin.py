@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import Reading, drop_missing, options_from
+from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 
 skin = typer.Typer(
     name="skin",
@@ -79,7 +79,7 @@ def show(
     file: Annotated[
         str, typer.Argument(metavar="SKIN", help="a shipped skin by name, or a file")
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: Json = False,
 ) -> None:
     """Describes a skin: sensor, scans, licence, and what it changes.
 
