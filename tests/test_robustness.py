@@ -1,25 +1,26 @@
 """The robustness card: its measures, the cases, and each kind of model, computed independently."""
 
 import json
+import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from project import ROOT
 from typer.testing import CliRunner
 
 from lidar_synth import Scan, Town, open_scans
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.lab.evaluate.robustness import (
+    BASELINE,
     NAMES_OF_BENCHMARK,
-    PUBLISHED,
     Card,
     cases,
     corrupt,
     count_points,
     open_model,
-    published,
     read_means,
     stress,
     write_cases,
@@ -55,13 +56,15 @@ def iou_of(scans: list[Scan]) -> float:
 
 def test_the_published_rows_give_the_published_means() -> None:
     """Those of the benchmark's paper: SqueezeSeg's mCE is 164.87 % and its mRR 66.81 %."""
-    figures = published("SqueezeSeg").to_dict()
+    tool = runpy.run_path(str(ROOT / "tools/research/weather_calibration.py"))
+    clean, *row = np.divide(tool["PUBLISHED"], 100).tolist()
+    scores = {n: [score] for n, score in zip(NAMES_OF_BENCHMARK, row, strict=True)}
+    figures = Card(clean, scores, BASELINE).to_dict()
     assert 100 * figures["mCE"] == pytest.approx(164.87, abs=0.01)
     assert 100 * figures["mRR"] == pytest.approx(66.81, abs=0.01)
-    own = published("MinkUNet-18").to_dict()
+    own = Card(0.6276, {n: [s] for n, s in BASELINE.items()}, BASELINE).to_dict()
     assert own["mCE"] == pytest.approx(1)
     assert 100 * own["mRR"] == pytest.approx(81.90, abs=0.01)
-    assert all(len(row) == 9 for row in PUBLISHED.values())
 
 
 def test_the_measures_by_hand() -> None:
@@ -72,6 +75,7 @@ def test_the_measures_by_hand() -> None:
     lines = card.to_text().splitlines()
     assert lines[3] == "| fog | 40.0 | 30.0 | 20.0 | 30.0 | 60.0 | 175.0 |"
     assert lines[4] == "| rain | 50.0 | 50.0 | 50.0 | 50.0 | 100.0 |  |"
+    assert Card(0.5, card.scores, {"fog": 1.0, "rain": 0.5}).errors == {"rain": 1.0}
 
 
 def test_a_function_is_scored_as_counted_by_hand(
@@ -118,6 +122,26 @@ def test_predictions_in_files_score_as_the_function_that_made_them(
         stress(scans, network, LOSSES, progress=False)
 
 
+def test_labels_that_were_written_are_no_predictions(
+    scans: list[Scan], tmp_path: Path
+) -> None:
+    write_cases(scans, tmp_path, LOSSES[:1])
+    network = open_model(str(tmp_path))
+    with pytest.raises(DataError, match="0 predictions for 2 scans"):
+        stress(scans, network, LOSSES[:1], progress=False)
+    for case in cases(LOSSES[:1]):
+        for points in (tmp_path / case).rglob("*.bin"):
+            beside = points.parents[1] / "predictions" / f"{points.stem}.label"
+            beside.parent.mkdir(exist_ok=True)
+            np.full(points.stat().st_size // 16, 40, "<u4").tofile(beside)
+    roads = stress(
+        scans,
+        lambda s, _: sum(count_points(x, np.full(len(x), 8)) for x in s),
+        LOSSES[:1],
+    )
+    assert stress(scans, network, LOSSES[:1]).to_dict() == roads.to_dict()
+
+
 def test_the_shipped_segmenter_is_a_model(scans: list[Scan]) -> None:
     card = stress(scans, open_model("town"), LOSSES[:1], progress=False)
     assert card.clean == mean_iou(load_judge().agreement(scans))
@@ -151,6 +175,27 @@ def test_bad_input_is_refused(scans: list[Scan]) -> None:
         cases(["fogg"])
     with pytest.raises(DataError, match="without labels"):
         list(corrupt([Scan(s.points, s.reflectance, s.sensor) for s in scans], "clean"))
+
+
+def test_the_command_writes_corruptions_once_and_beside_the_scans(
+    tmp_path: Path,
+) -> None:
+    root = tmp_path / "scans"
+    run("town", root, "--scans", 1, "--layout", "semantic_kitti", "--no-camera")
+    for points in root.rglob("*.bin"):
+        values = np.fromfile(points, np.float32).reshape(-1, 4)
+        (values * [1, 1, 1, 255]).astype(np.float32).tofile(points)
+    before = sorted(root.rglob("*"))
+    given = ["stress", root, "--reflectance-max", 255, "--corruptions", "fog, snow,fog"]
+    for out in (root, root / "stressed"):
+        with pytest.raises(ConfigError, match="inside of .*a folder outside of it"):
+            run(*given, "--out", out)
+    assert sorted(root.rglob("*")) == before
+    run(*given, "--out", tmp_path / "out")
+    made = {p.name for p in (tmp_path / "out").iterdir() if p.is_dir()}
+    assert made == {"clean", "fog", "snow"}
+    [clean] = (tmp_path / "out" / "clean").rglob("*.bin")
+    assert np.fromfile(clean, np.float32)[3::4].max() <= 1
 
 
 def run(*words: object) -> str:

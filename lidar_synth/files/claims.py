@@ -18,6 +18,18 @@ _SHORT.maxstring = 100
 _SHORT.maxdict = 8
 
 
+def require_outside(out: Path, root: Path) -> None:
+    """Refuse to write into the folder that is read.
+
+    Raises:
+        ConfigError: if ``out`` is ``root`` or lies in it.
+    """
+    out = out.resolve()
+    root = root.resolve()
+    if root in (out, *out.parents):
+        raise ConfigError(f"--out {out} inside of {root}", "a folder outside of it")
+
+
 def claim(path: Path, settings: dict[str, Any]) -> None:
     """Record the settings of an output folder in a file, and refuse a folder with other settings.
 

@@ -11,7 +11,11 @@ from pathlib import Path
 from typer import run
 
 from lidar_synth import SemanticKITTI
-from lidar_synth.lab.evaluate.robustness import open_model, published, stress
+from lidar_synth.lab.evaluate.robustness import NAMES_OF_BENCHMARK, open_model, stress
+
+PUBLISHED = (31.61, 18.85, 27.30, 22.70, 17.93, 25.01, 21.65, 27.66, 7.85)
+"""SqueezeSeg's mIoU on SemanticKITTI, %: clean, then each of ``NAMES_OF_BENCHMARK``, mean of the
+severities."""
 
 
 def main(judge: Path, labelled: Path, every: int = 1) -> None:
@@ -21,7 +25,8 @@ def main(judge: Path, labelled: Path, every: int = 1) -> None:
     card = stress(scans, open_model(str(judge)))
     print(f"{len(scans)} scans\n\n{card.to_text()}\n\n| % | published RR | RR | off |")
     print("|---|---:|---:|---:|")
-    for name, share in published("SqueezeSeg").resilience.items():
+    for name, score in zip(NAMES_OF_BENCHMARK, PUBLISHED[1:], strict=True):
+        share = score / PUBLISHED[0]
         own = card.resilience[name]
         row = f"{100 * share:.1f} | {100 * own:.1f} | {100 * (own - share):+.1f}"
         print(f"| {name} | {row} |")

@@ -1,11 +1,14 @@
 """``lidar-synth stress``: a robustness card of a segmentation network."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 
+
+@options_from(Reading, after="sensor")
 def stress(
     scans: Annotated[
         Path,
@@ -38,12 +41,12 @@ def stress(
             help="page (.html) or picture (.png) of the first scan, corrupted"
         ),
     ] = None,
-    split: Annotated[str | None, typer.Option(help="split of SCANS")] = None,
     sensor: Annotated[
         str | None, typer.Option(help="sensor of SCANS: a preset or a YAML file")
     ] = None,
     seed: Annotated[int, typer.Option(help="of the corruptions", min=0)] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: Json = False,
+    **reading: Any,
 ) -> None:
     """Corrupts labelled scans by weather and failing sensors at three severities, and prints how
     much of its mIoU a network keeps, as the Robo3D benchmark measures it: RR is the share of the
@@ -66,6 +69,7 @@ def stress(
     """
     import json
 
+    from lidar_synth.files.claims import require_outside
     from lidar_synth.formats import open_scans
     from lidar_synth.lab.evaluate import robustness
     from lidar_synth.viz import view_suffix, write_view
@@ -77,14 +81,16 @@ def stress(
         view_suffix(view)
     names = robustness.NAMES_OF_BENCHMARK
     if corruptions:
-        names = tuple(CORRUPTIONS if corruptions == "all" else corruptions.split(","))
-    source = open_scans(scans, sensor=sensor, split=split)
+        given = (name.strip() for name in corruptions.split(","))
+        names = tuple(CORRUPTIONS if corruptions == "all" else dict.fromkeys(given))
+    source = open_scans(scans, sensor=sensor, **drop_missing(reading))
     if out is not None:
+        require_outside(out, scans)
         written = robustness.write_cases(source, out, names, seed)
         typer.echo(f"{out}: {written} scans written", err=True)
     if model is None:
         return
-    other = None if baseline is None else robustness.read_means(baseline)
+    other = robustness.read_means(baseline) if baseline else robustness.BASELINE
     network = robustness.open_model(model)
     card = robustness.stress(source, network, names, other, seed, not as_json)
     if view is not None:
