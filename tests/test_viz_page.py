@@ -92,6 +92,14 @@ def test_the_page_contains_all_points(page: str, scans: list[Scan]) -> None:
             )
 
 
+def test_one_far_point_leaves_the_others_where_they_are(scans: list[Scan]) -> None:
+    scan = scans[0]
+    points = scan.points.copy()
+    points[0, 0] = 65535
+    _, metres = pack(replace(scan, points=points))
+    assert metres <= 4 * scan.sensor.range_max / 32767
+
+
 def test_labels_of_any_integers_are_packed_as_bytes(scans: list[Scan]) -> None:
     """Predictions of a network are int64."""
     scan = next(s for s in scans if s.label is not None)

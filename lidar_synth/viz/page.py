@@ -41,10 +41,12 @@ def pack(scan: Scan) -> tuple[bytes, float]:
         The compressed bytes of these arrays, one after the other, and the length of a quantisation
         step in metres: x, y and z, (N,) int16 each, in steps, as differences from the previous
         point (modulo 2**16); reflectance * 255, (N,) uint8; label, (N,) uint8 train ids, 255 =
-        ignore; and, if the scan has it, confidence * 255, (N,) uint8.
+        ignore; and, if the scan has it, confidence * 255, (N,) uint8. Coordinates end at four
+        times the sensor's range, so that one far point does not coarsen the others.
     """
-    metres = max(float(np.abs(scan.points).max(initial=0.0)), 1.0) / 32767
-    places = np.rint(scan.points / metres).astype("<i2")
+    farthest = float(np.abs(scan.points).max(initial=1.0))
+    metres = min(farthest, 4 * scan.sensor.range_max) / 32767
+    places = np.rint(scan.points / metres).clip(-32767, 32767).astype("<i2")
     columns = [np.diff(places[:, axis], prepend=np.int16(0)) for axis in range(3)]
     columns += [
         _byte(scan.reflectance),
@@ -79,7 +81,7 @@ def html_page(
         title: the heading.
         notes: text below the heading; an empty line starts a paragraph.
         domains: what the page calls real and synthetic scans.
-        panels: HTML below the viewer, inserted as it is; ``panels.py`` makes some.
+        panels: HTML below the viewer, inserted as it is.
 
     Raises:
         ConfigError: without scans.

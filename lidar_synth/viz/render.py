@@ -267,7 +267,7 @@ def render(
 
     Args:
         scan: the scan to show.
-        by: the quantity that colours the points, one of ``colour.VALUES``.
+        by: the quantity that colours the points, one of ``scales.VALUES``.
         camera: the camera; by default that of ``Orbit()``.
         size: width and height in pixels.
         scale: the colour scale; by default that of this scan alone.

@@ -92,7 +92,7 @@ def contact_sheet(
     Args:
         given: scans or range images, at least one.
         columns: tiles per row; by default the sheet is about square.
-        by: the quantity that colours the points, one of ``colour.VALUES``; by default labels if all
+        by: the quantity that colours the points, one of ``scales.VALUES``; by default labels if all
             scans have them, otherwise heights.
         title: the title line.
 
