@@ -188,6 +188,7 @@ def test_scans_with_boxes_get_the_town_with_boxes(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no box with 5 points"):
         exec(script, {})  # the random boxes hold no objects that could be pasted
     assert 'task="detection"' in made.code and ".with_boxes()" in made.code
+    assert "in 0 of 3 scans looked at" in made.found[1]
     assert "in unknown drives" in made.found[0] and "for 30 of 40" in made.found[4]
     town = lidar_synth.open_scans(tmp_path / "out" / "town")
     assert len(town) == 1 and town[0].boxes is not None and town[0].label is not None
@@ -204,6 +205,13 @@ def test_what_start_refuses(tmp_path: Path) -> None:
         lidar_synth.start(tmp_path / "others", tmp_path / "start", **quiet)
     with pytest.raises(ConfigError, match=r"Did you mean 'openpcdet'"):
         lidar_synth.start(tmp_path / "scans", tmp_path / "new", trainer="openpcd")
+    with pytest.raises(ConfigError, match="reflectance_max.*convert .*semantic_kitti"):
+        lidar_synth.start(
+            tmp_path / "scans",
+            tmp_path / "new",
+            trainer="rangenet",
+            reflectance_max=255.0,
+        )
     with pytest.raises(ConfigError, match=r"--task detection for .*segmentation"):
         lidar_synth.start(tmp_path / "scans", tmp_path / "new", task="detection")
     assert not (tmp_path / "new").exists()

@@ -12,7 +12,7 @@ import numpy as np
 from lidar_synth.bake import BakeJob, BakePlan, Resources, bake, make_plan
 from lidar_synth.bake.estimate import estimate
 from lidar_synth.errors import ConfigError, DataError, choose
-from lidar_synth.files.claims import claim, hold_writing
+from lidar_synth.files.claims import claim, hold_writing, require_outside
 from lidar_synth.files.disk import write_file
 from lidar_synth.files.processes import usable_cores
 from lidar_synth.formats.camera_boxes import CameraBoxes
@@ -244,9 +244,9 @@ def start(
     """
     root = Path(root).resolve()
     out = Path(out).resolve()
-    if root == out or root in out.parents:
-        raise ConfigError(f"--out {out} inside of {root}", "a folder outside of it")
+    require_outside(out, root)
     found = look(root, sensor, out / SENSOR, reading)
+    seen = found.lines()
     task = _task(found, task)
     if task == "detection" and isinstance(found.source, CameraBoxes):
         found = replace(found, source=found.source.with_boxes())
@@ -255,7 +255,7 @@ def start(
     plan = StartPlan(found, task, cast, out, scans, minutes, jobs)
     if trainer is not None:
         _configure(plan, trainer)  # complains before anything is made
-    lines = (*found.lines(), plan.line())
+    lines = (*seen, plan.line())
     say("\n".join(lines))
     if dry_run:
         say(_estimate(plan))
@@ -423,7 +423,16 @@ def _cost(minutes: float, size: float) -> str:
 def _configure(plan: StartPlan, trainer: str) -> dict[str, str]:
     task = "segmentation" if plan.task == "unlabelled" else plan.task
     root = str(plan.found.source.root)
-    return configure(trainer, task, plan.settings(), root, str(plan.out), _real(plan))
+    files = configure(trainer, task, plan.settings(), root, str(plan.out), _real(plan))
+    changing = plan.found.options.keys() & {"fields", "reflectance_max", "on_bad"}
+    if changing and trainer != "lightning":
+        layout = "kitti_object" if task == "detection" else "semantic_kitti"
+        raise ConfigError(
+            f"--trainer {trainer}, which reads the files itself, with {', '.join(changing)}",
+            "files that need no such options",
+            f"First type lidar-synth convert {root} OUT --to {layout} with them.",
+        )
+    return files
 
 
 def _real(plan: StartPlan) -> str:
