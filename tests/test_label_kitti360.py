@@ -177,6 +177,11 @@ def test_a_rerun_repeats_only_what_is_missing_or_changed(
     again = label_scans(copy, out, jobs=2, progress=False)
     assert again.kept == 1 and again.to_dict() == first.to_dict()
     assert {p: p.read_bytes() for p in sorted(out.rglob("*.label"))} == content
+    confidence = confidence_path(out, DRIVE, f"{0:010d}")
+    lost = confidence.read_bytes()
+    confidence.unlink()
+    assert label_scans(copy, out, progress=False).kept == 1
+    assert confidence.read_bytes() == lost
     poses = copy / "data_poses" / DRIVE / "poses.txt"
     poses.write_text(poses.read_text() + "\n")
     assert label_scans(copy, out, progress=False).kept == 0
@@ -535,10 +540,12 @@ def test_what_cannot_be_accumulated_is_refused(
 def test_the_command_prints_a_report(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run(["label", "kitti360", str(root), str(tmp_path), "--dry-run"])
-    assert f"{SCANS} scans in 2 windows" in capsys.readouterr().out and not list(
-        tmp_path.iterdir()
-    )
+    dry = ["label", "kitti360", str(root), str(tmp_path), "--dry-run"]
+    run(dry)
+    assert f"{SCANS} scans in 2 windows" in capsys.readouterr().out
+    run([*dry, "--json"])
+    assert json.loads(capsys.readouterr().out) == {"scans": SCANS, "windows": 2}
+    assert not list(tmp_path.iterdir())
     run(["label", "kitti360", str(root), str(tmp_path), "--against", str(root)])
     text = capsys.readouterr().out
     assert f"{SCANS} scans labelled" in text and "right" in text and "building" in text

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidar_synth.cli.options import local_path
+from lidar_synth.cli.options import Json, local_path
 
 if TYPE_CHECKING:
     from lidar_synth.lab.kitti360.report import LabelReport
@@ -42,9 +42,7 @@ def label(
         bool,
         typer.Option("--dry-run", help="only count the frames that would get labels"),
     ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="print the report as JSON")
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """Labels KITTI-360's scans from its accumulated clouds, with a confidence per point and a
     report by class.
@@ -67,7 +65,11 @@ def label(
         raise ConfigError(f"dataset {dataset!r}", "kitti360", hint)
     if dry_run:
         plan = plan_labels(root, split)
-        print(f"{plan.frames} scans in {len(plan.jobs)} windows would get labels")
+        windows = len(plan.jobs)
+        if as_json:
+            print(json.dumps({"scans": plan.frames, "windows": windows}))
+        else:
+            print(f"{plan.frames} scans in {windows} windows would get labels")
         _print_frames(plan.without_pose, plan.outside, plan.without_clouds)
         return
     report = label_scans(

@@ -241,8 +241,11 @@ def _label_window(
     path = folder.parent / "windows" / f"{job.window.name}.json"
     made_of = _inputs(root, against, job)
     record = _read_record(path)
+    names = [f"{int(frame):010d}" for frame in record.get("fitting", ())]
     if record.get("inputs") == made_of and all(
-        (folder / f"{int(f):010d}.label").is_file() for f in record["fitting"]
+        (folder / f"{name}.label").is_file()
+        and confidence_path(out, job.drive, name).is_file()
+        for name in names
     ):
         return record | {"kept": True}
     poses = fill_poses(
