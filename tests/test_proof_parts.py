@@ -1,6 +1,7 @@
 """The parts of ``prove``: places, arms, scores and intervals, the plan, a trainer as a command, the
 page."""
 
+import re
 import shlex
 import sys
 from collections import Counter
@@ -93,6 +94,18 @@ def test_between_stretches_scans_are_left_out() -> None:
     places = find_places(Scans([f"002/{i:02d}" for i in range(39)]), "stretch:2")
     assert [len(p) for p in places.values()] == [15, 15]
     assert list(places.values()) == [list(range(15)), list(range(24, 39))]
+
+
+def test_every_scan_of_a_long_source_is_of_a_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("lidar_synth.lab.proof.places.MOST_POSES", 4)
+    assert find_places(SOURCES["pose"], "pose") == {
+        "00, place 1": [0, 1, 2, 3],
+        "00, place 2": [4, 5],
+        "00, place 3": [6, 7],
+        "00, place 4": [8],
+    }
 
 
 def test_auto_takes_drives_and_else_poses() -> None:
@@ -403,8 +416,10 @@ def test_a_plan_keeps_to_its_minutes_by_whole_pairs_and_places_come_before_seeds
     assert 10 <= fewer.settings.iterations < plan.settings.iterations
     resumed = within(plan, few, resumed=True)
     assert resumed.pairs == plan.pairs[:2] and resumed.settings == plan.settings
-    with pytest.raises(ConfigError, match=r"fewer arms \(--arm\)\.$"):
+    with pytest.raises(ConfigError, match=r"fewer arms \(--arm\)\.$") as error:
         within(plan, 0.001)
+    [least] = re.findall(r"about (\d+) or more", str(error.value))
+    assert within(plan, int(least)).settings.iterations < 20
 
 
 def scans_with(**changes: object) -> Scans:
@@ -500,9 +515,8 @@ job = yaml.safe_load(open(sys.argv[1]))
 real, seen = SemanticKITTI(job["real"]), 0
 for stage in job["stages"]:
     synth = SemanticKITTI(stage["synthetic"]) if stage["synthetic"] else None
-    size = stage["iterations"] * job["batch"]
-    mixed = MixedScans(None if stage["ratio"] == 1 else real, synth, stage["ratio"],
-                       labels=stage["labels"], seed=job["seed"], epoch_size=size)
+    given = {k: v for k, v in stage.items() if k not in ("iterations", "synthetic")}
+    mixed = MixedScans(real, synth, seed=job["seed"], **given)
     seen += sum(len(mixed[i]["points"]) > 0 for i in range(2)) > 0
 assert seen == len(job["stages"])
 held_out = SemanticKITTI(job["held_out"])

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from math import ceil
 
 import numpy as np
 import torch
@@ -71,23 +72,17 @@ def within(plan: ProofPlan, minutes: float | None, resumed: bool = False) -> Pro
 
 
 def _with_fewer_iterations(plan: ProofPlan, least: int, minutes: float) -> ProofPlan:
-    few = _most_iterations(plan, plan.pairs[:least], minutes)
-    if not few:
-        raise ConfigError(
-            f"{minutes:g} minutes, in which {least} places cannot be tested",
-            f"about {estimate_minutes(plan, plan.pairs[:least]):.0f} or more",
-            "Give more --minutes or fewer arms (--arm).",
-        )
-    return replace(plan, settings=replace(plan.settings, iterations=few))
-
-
-def _most_iterations(plan: ProofPlan, pairs: Sequence[Pair], minutes: float) -> int:
-    """With how many iterations, a multiple of ten, some pairs fit into the time; 0 = none."""
+    """The plan with as many iterations, a multiple of ten, as fit for some pairs."""
     for count in range(plan.settings.iterations // 10 * 10, 0, -10):
         shorter = replace(plan, settings=replace(plan.settings, iterations=count))
-        if estimate_minutes(shorter, pairs) <= minutes:
-            return count
-    return 0
+        needed = estimate_minutes(shorter, plan.pairs[:least])
+        if needed <= minutes:
+            return shorter
+    raise ConfigError(
+        f"{minutes:g} minutes, in which {least} places cannot be tested",
+        f"about {ceil(needed)} or more",
+        "Give more --minutes or fewer arms (--arm).",
+    )
 
 
 def measure_step(

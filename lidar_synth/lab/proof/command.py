@@ -33,7 +33,8 @@ class CommandTrainer:
 
     ``{job}`` in it stands for a YAML file with ``seed``, ``batch``, ``iterations``; ``real``, the
     folder of the labelled scans; ``stages``, one after the other, each with ``iterations``,
-    ``ratio``, ``synthetic`` (a folder, or null) and ``labels``, as for ``MixedScans``;
+    ``ratio``, ``epoch_size``, ``synthetic`` (a folder, or null) and ``labels``, as for
+    ``MixedScans``;
     ``held_out``, a folder of scans without labels; and ``predictions``, the folder to write one
     ``NNNNNN.label`` to for each of them. All folders of scans have SemanticKITTI's layout, and
     predictions its values: (N,) uint32, one for each point.
@@ -116,6 +117,7 @@ def _describe_stage(job: Job, stage: ArmStage, iterations: int) -> dict[str, Any
     return {
         "iterations": iterations,
         "ratio": float(stage.ratio),
+        "epoch_size": "replace",
         "synthetic": str(folder.resolve()) if stage.ratio else None,
         "labels": {stage.labels: options} if options else stage.labels,
     }

@@ -55,14 +55,11 @@ def by_pose(source: Source, names: Sequence[str]) -> Places:
     places: Places = {}
     for drive, indices in by_drive(source, names).items():
         # Neighbouring frames are metres apart: some of them show where the drive went.
-        indices = indices[:: max(1, len(names) // MOST_POSES)]
-        positions = np.array([_position(source, i) for i in indices])
-        cluster = join_cubes(positions * (1, 1, 0), APART)
-        for number in range(cluster.max() + 1):
-            name = f"{drive}, place {number + 1}"
-            places[name] = [
-                i for i, c in zip(indices, cluster, strict=True) if c == number
-            ]
+        step = max(1, len(names) // MOST_POSES)
+        positions = np.array([_position(source, i) for i in indices[::step]])
+        cluster = np.repeat(join_cubes(positions * (1, 1, 0), APART), step)
+        for index, number in zip(indices, cluster, strict=False):
+            places.setdefault(f"{drive}, place {number + 1}", []).append(index)
     return places
 
 
