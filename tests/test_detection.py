@@ -285,7 +285,7 @@ def test_tested_scans_are_read_one_at_a_time(
     assert source.most <= 3  # that to train on, one, and the one before it
 
 
-def test_a_plan_reads_no_scan_and_the_page_has_the_labelled_scans_of_each_seed(
+def test_a_plan_reads_one_scan_and_the_page_has_the_labelled_scans_of_each_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = Drives()
@@ -293,7 +293,7 @@ def test_a_plan_reads_no_scan_and_the_page_has_the_labelled_scans_of_each_seed(
     settings = DetectionSettings(labelled=100, arms=("real",))
     work = DetectionWork(source, settings, tmp_path, tmp_path)
     assert "3 scans in 3 places" in study.describe(work)
-    assert not source.read
+    assert len(source.read) == 1
     empty = {"boxes": [], "scores": [], "classes": []}
     monkeypatch.setattr(
         DetectionWork,
@@ -312,6 +312,8 @@ def test_scans_without_boxes_are_refused(tmp_path: Path) -> None:
     ]
     with pytest.raises(DataError, match="without boxes"):
         prove_detection(bare, tmp_path)
+    with pytest.raises(DataError, match="without boxes"):
+        study.describe(DetectionWork(bare, DetectionSettings(), tmp_path, tmp_path))
 
 
 def test_a_dry_run_says_what_would_be_trained(places: Path, tmp_path: Path) -> None:
@@ -322,7 +324,7 @@ def test_a_dry_run_says_what_would_be_trained(places: Path, tmp_path: Path) -> N
     )
     assert result.exit_code == 0, result.output
     assert "4 scans in 4 places: place0 (1), place1 (1)" in result.output
-    assert "4 trainings of 1000 iterations of 2:" in result.output
+    assert "4 trainings of 800 iterations of 2:" in result.output
     assert "seed 1: 2 labelled scans, tested on place" in result.output
     assert "the town first, then half, real scans last, GT sampling" in result.output
     assert not out.exists()
@@ -345,7 +347,8 @@ def test_a_scan_with_boxes_along_the_way_of_a_car_is_named(
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("--only", "car"), ("--model", "none"), ("--classes", "none")]
+    ("option", "value"),
+    [("--only", "car"), ("--model", "none"), ("--classes", "none"), ("--jobs", "2")],
 )
 def test_options_of_the_other_task_are_refused(
     places: Path, tmp_path: Path, option: str, value: str

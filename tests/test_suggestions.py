@@ -145,6 +145,34 @@ def test_a_wrong_command_is_answered(
     assert COMMANDS[call] in said and "\n" not in said
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        "adapt town --scans SCANS --out m.safetensors",
+        "check-mix mix.yaml SCANS",
+        "evaluate SCANS SCANS --protocol town",
+        "prove SCANS",
+        "stress SCANS town",
+    ],
+)
+def test_commands_of_real_scans_say_how_they_are_read(
+    call: str, there: dict[str, str]
+) -> None:
+    """Such as by ``--reflectance-max``, which other errors tell the user to type."""
+    given = [there.get(word, word) for word in call.split()]
+    given += ["--reflectance-max", "255", "--fields", "4", "--on-bad", "skip"]
+    result = CliRunner().invoke(app, [*given, "--layout", "kitti_ra"])
+    assert "Did you mean 'kitti_raw'" in str(result.exception)
+
+
+def test_a_trainer_without_its_file_is_refused_before_a_plan(
+    there: dict[str, str],
+) -> None:
+    given = ["prove", there["SCANS"], "--trainer", "python mine.py", "--dry-run"]
+    result = CliRunner().invoke(app, given)
+    assert "a command with {job}" in str(result.exception)
+
+
 @pytest.mark.parametrize("call", PYTHON)
 def test_a_wrong_call_is_answered(call: str, there: dict[str, str]) -> None:
     with pytest.raises(Exception) as caught, warnings.catch_warnings():

@@ -2,15 +2,18 @@
 
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from lidar_synth.cli.options import Reading, drop_missing, options_from
 
 if TYPE_CHECKING:
     from lidar_synth.geometry.scan import Scan
     from lidar_synth.mixing.meaning import Meaning
 
 
+@options_from(Reading, after="sensor")
 def check_mix(
     mix: Annotated[
         Path,
@@ -34,6 +37,7 @@ def check_mix(
     sensor: Annotated[
         str | None, typer.Option(help="sensor of the real scans [named by the files]")
     ] = None,
+    **reading: Any,
 ) -> None:
     """Compares synthetic scans with real ones: points, rows, ground, columns and classes, side by
     side.
@@ -61,7 +65,7 @@ def check_mix(
 
     if out is not None:
         view_suffix(out)
-    source = open_scans(real, sensor=sensor)
+    source = open_scans(real, sensor=sensor, **drop_missing(reading))
     settings = read_settings(mix)
     # Ids of the trainer's files; here both kinds have train ids.
     settings.pop("classes", None)

@@ -1,11 +1,14 @@
 """``lidar-synth adapt``: from a shipped model to the sensor and the streets of the user's scans."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from lidar_synth.cli.options import Reading, drop_missing, options_from
 
+
+@options_from(Reading, after="sensor")
 def adapt(
     model: Annotated[
         str,
@@ -41,6 +44,7 @@ def adapt(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the plan and do nothing")
     ] = False,
+    **reading: Any,
 ) -> None:
     """Adapts a model to your sensor and your streets: autoencoder, flow and student.
 
@@ -55,10 +59,18 @@ def adapt(
     from lidar_synth.lab.train.adaptation import adapt as run
     from lidar_synth.lab.train.adaptation import plan_adaptation
 
+    given = drop_missing(reading)
     if dry_run:
-        typer.echo(plan_adaptation(model, scans, out, minutes, sensor, town))
+        typer.echo(plan_adaptation(model, scans, out, minutes, sensor, town, **given))
         return
     path = run(
-        model, scans, out, minutes=minutes, licence=licence, sensor=sensor, town=town
+        model,
+        scans,
+        out,
+        minutes=minutes,
+        licence=licence,
+        sensor=sensor,
+        town=town,
+        **given,
     )
     typer.echo(f"{path}\nIts card is {path.with_suffix('.md')}")

@@ -3,14 +3,17 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 
 if TYPE_CHECKING:
     from lidar_synth.geometry.scan import Source
 
 
+@options_from(Reading, after="sensor")
 def evaluate(
     real: Annotated[
         Path,
@@ -51,11 +54,11 @@ def evaluate(
     columns: Annotated[
         int | None, typer.Option(help="width of the judge's grid; its own by default")
     ] = None,
-    split: Annotated[
-        str | None, typer.Option(help="split of REAL, for instance r2flow/test")
-    ] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="sensor of both sets: a preset or a YAML file")
+        str | None,
+        typer.Option(
+            help="sensor of both sets: a preset or a YAML file; the next options are of REAL"
+        ),
     ] = None,
     segmenter: Annotated[
         bool, typer.Option(help="add metrics on features of the town's segmenter")
@@ -91,7 +94,8 @@ def evaluate(
         bool,
         typer.Option(help="compare fewer scans than the paper's, and other sensors"),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: Json = False,
+    **reading: Any,
 ) -> None:
     """Compares two sets of scans: Jensen-Shannon distance and MMD of bird's-eye views; distances of
     features where the published weights are at hand; general: ranges and classes; spiral: classes.
@@ -121,7 +125,7 @@ def evaluate(
       lidar-synth evaluate SemanticKITTI town --objects
       lidar-synth evaluate KITTI town --detector pointpillar_7728.pth
     """
-    from lidar_synth.errors import suggest
+    from lidar_synth.errors import choose
     from lidar_synth.formats import open_scans
     from lidar_synth.lab.evaluate import PROTOCOLS
     from lidar_synth.lab.evaluate import evaluate as compare
@@ -158,14 +162,13 @@ def evaluate(
         for option, given in options.items():
             if given and chosen is None:
                 raise typer.BadParameter(f"goes with {needed}", param_hint=option)
-    if protocol is not None and protocol not in PROTOCOLS:
-        known = f"{protocol!r} is none of {', '.join(PROTOCOLS)}. {suggest(protocol, PROTOCOLS)}"
-        raise typer.BadParameter(known, param_hint="--protocol")
+    if protocol is not None:
+        rules = choose("--protocol", protocol, PROTOCOLS)
     sources = (
-        open_scans(real, sensor=sensor, split=split),
+        open_scans(real, sensor=sensor, **drop_missing(reading)),
         open_scans(fake, sensor=sensor),
     )
-    if not training_data and (note := refuse_training_data(*sources, split)):
+    if not training_data and (note := refuse_training_data(*sources, reading["split"])):
         typer.echo(note, err=True)
     if judge is not None:
         _recognition(judge, columns, sources, as_json)
@@ -176,7 +179,6 @@ def evaluate(
     if objects:
         _objects(sources, as_json)
         return
-    rules = PROTOCOLS[str(protocol)]
     extractors = {"the town segmenter": load_judge().features} if segmenter else {}
     left_out: dict[str, str] = {}
     scores = compare(
@@ -196,7 +198,7 @@ def evaluate(
     _print([asdict(s) for s in scores], "\n".join(map(str, scores)), as_json)
     for note in filter(None, (describe_missing(left_out, rules), rules.unverified)):
         typer.echo(note, err=True)
-    if beside and not as_json:
+    if beside:
         typer.echo(f"\n{published(scores)}")
 
 

@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from lidar_synth.cli.options import Reading, drop_missing, options_from
+
 _ARMS = (
     "a training to compare, repeatable: real | longer | exchange | town | skin | "
     "generator | pretrain | pretrain-skin | pretrain-generator | alone | "
@@ -13,6 +15,7 @@ _ARMS = (
 )
 
 
+@options_from(Reading, after="sensor")
 def prove(
     root: Annotated[
         Path,
@@ -37,31 +40,41 @@ def prove(
         typer.Option(help="share of synthetic scans, repeatable [0.5]"),
     ] = None,
     iterations: Annotated[
-        int, typer.Option(min=10, help="of each training; fewer if --minutes is short")
-    ] = 1000,
+        int | None,
+        typer.Option(
+            min=10,
+            help="of each training; fewer if --minutes is short [1000, of a detector 800]",
+        ),
+    ] = None,
     batch: Annotated[
         int | None,
         typer.Option(min=1, help="scans of an iteration [4, of a detector 2]"),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="repetitions of each training")] = 2,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="repetitions of each training [2]")
+    ] = None,
     places: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="how places are told apart: auto | drive | pose | stretch | stretch:N"
+            help="how places are told apart: drive | pose | stretch | stretch:N [auto]"
         ),
-    ] = "auto",
+    ] = None,
     model: Annotated[
-        str, typer.Option(help="of the arms with a generator: a name or a file")
-    ] = "town",
+        str | None,
+        typer.Option(help="of the arms with a generator: a name or a file [town]"),
+    ] = None,
     synthetic: Annotated[
-        int, typer.Option(min=1, help="synthetic scans of each kind")
-    ] = 150,
-    classes: Annotated[
-        str,
+        int | None,
         typer.Option(
-            help="pooled classes: auto | semantic_kitti | pandaset | kitti360 | nuscenes"
+            min=1, help="synthetic scans of each kind [150, for a detector 120]"
         ),
-    ] = "auto",
+    ] = None,
+    classes: Annotated[
+        str | None,
+        typer.Option(
+            help="pooled classes: semantic_kitti | pandaset | kitti360 | nuscenes [auto]"
+        ),
+    ] = None,
     only: Annotated[
         list[str] | None,
         typer.Option(metavar="CLASS", help="mean IoU over this class, repeatable"),
@@ -81,9 +94,6 @@ def prove(
             metavar="N",
             help="evenly spaced beams that all scans keep, such as 32 [all]",
         ),
-    ] = None,
-    split: Annotated[
-        str | None, typer.Option(help="split of ROOT, if its layout has splits")
     ] = None,
     tests: Annotated[
         Path | None,
@@ -106,6 +116,7 @@ def prove(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the plan and do nothing")
     ] = False,
+    **reading: Any,
 ) -> None:
     """Trains a small network with and without synthetic scans, and tests on places that were left
     out, or on other scans.
@@ -128,46 +139,43 @@ def prove(
     from lidar_synth.lab.proof.plan import describe
     from lidar_synth.lab.proof.planning import make_plan
 
+    given = drop_missing(reading)
+    both = {
+        "labelled": labelled,
+        "arms": tuple(arm or ()) or None,
+        "iterations": iterations,
+        "batch": batch,
+        "seeds": seeds,
+        "places": places,
+        "synthetic": synthetic,
+    }
+    own: dict[str, Any] = {"model": model, "classes": classes, "beams": beams}
     if task != "segmentation":
-        further = {
-            "--trainer": trainer,
-            "--tests": tests,
-            "--ratio": ratio,
-            "--only": only,
-            "--beams": beams,
-            "--model": model != "town",
-            "--classes": classes != "auto",
+        more = {
+            "trainer": trainer,
+            "tests": tests,
+            "jobs": jobs,
+            "ratio": ratio or None,
+            "only": only or None,
         }
-        _check_task(task, [name for name, given in further.items() if given])
-        options = {
-            "labelled": labelled,
-            "arms": tuple(arm or ()),
-            "batch": batch,
-            "iterations": iterations,
-            "seeds": seeds,
-            "places": places,
-            "synthetic": synthetic,
-        }
-        source = open_scans(root, sensor=sensor, split=split)
-        _prove_detection(source, out, options, minutes, pools, device, dry_run)
+        _check_task(task, drop_missing(own | more))
+        limits = drop_missing({"minutes": minutes, "pools": pools})
+        source = open_scans(root, sensor=sensor, **given)
+        _prove_detection(
+            source, out, drop_missing(both), dry_run, device=device, **limits
+        )
         return
     settings = ProofSettings(
-        labelled=labelled,
-        arms=tuple(arm or ProofSettings.arms),
-        ratios=tuple(ratio or (0.5,)),
-        iterations=iterations,
-        batch=batch or 4,
-        seeds=seeds,
-        places=places,
-        synthetic=synthetic,
-        model=model,
-        classes=classes,
+        **drop_missing(both | own),
+        ratios=tuple(ratio or ProofSettings.ratios),
         only=tuple(only or ()),
-        beams=beams,
         columns=None if trainer else 512,
     )
-    source = open_scans(root, sensor=sensor, split=split)
-    others = open_scans(tests, sensor=sensor) if tests else None
+    chosen = CommandTrainer(trainer) if trainer else reference
+    source = open_scans(root, sensor=sensor, **given)
+    # Split and layout are of ROOT.
+    alike = given | {"split": None, "layout": None}
+    others = open_scans(tests, sensor=sensor, **alike) if tests else None
     if dry_run:
         jobs = jobs or usable_cores()
         plan, _ = make_plan(
@@ -175,7 +183,6 @@ def prove(
         )
         typer.echo(describe(plan))
         return
-    chosen = CommandTrainer(trainer) if trainer else reference
     proof = run(
         source,
         out,
@@ -190,25 +197,19 @@ def prove(
     typer.echo(f"{proof}\n\nThe page is {(out / 'index.html').resolve()}")
 
 
-def _check_task(task: str, further: list[str]) -> None:
+def _check_task(task: str, further: dict[str, Any]) -> None:
     from lidar_synth.errors import ConfigError, choose
 
     choose("--task", task, dict.fromkeys(("segmentation", "detection")))
     if further:
         raise ConfigError(
-            f"--task {task} with {', '.join(further)}",
+            f"--task {task} with --{', --'.join(further)}",
             "--task detection without options of segmentation",
         )
 
 
 def _prove_detection(
-    source: Any,
-    out: Path,
-    options: dict[str, Any],
-    minutes: float | None,
-    pools: Path | None,
-    device: str,
-    dry_run: bool,
+    source: Any, out: Path, given: dict[str, Any], dry_run: bool, **options: Any
 ) -> None:
     from lidar_synth.lab.proof.detection import DetectionSettings, prove_detection
     from lidar_synth.lab.proof.detection.page import format_table
@@ -218,19 +219,11 @@ def _prove_detection(
         with_boxes,
     )
 
-    given = {name: value for name, value in options.items() if value}
     settings = DetectionSettings(**given)
     if dry_run:
-        work = DetectionWork(with_boxes(source), settings, out, pools or out)
+        work = DetectionWork(with_boxes(source), settings, out, out)
         typer.echo(describe(work))
         return
-    values = prove_detection(
-        source,
-        out,
-        settings,
-        minutes=float("inf") if minutes is None else minutes,
-        pools=pools,
-        device=device,
-    )
+    values = prove_detection(source, out, settings, **options)
     page = (out / "index.html").resolve()
     typer.echo(f"{format_table(values)}\n\nThe page is {page}")

@@ -347,12 +347,13 @@ def _truths(source: Source) -> dict[int, Truth]:
 
 
 def describe(work: DetectionWork) -> str:
-    """What would be trained and tested, in words, without a look at the boxes.
+    """What would be trained and tested, in words, by a look at the boxes of the first scan.
 
     Raises:
-        ConfigError, DataError: as ``find_places``.
+        ConfigError, DataError: as ``find_places``; a DataError also on a scan without boxes.
     """
     settings = work.settings
+    detected(work.source[0])
     counts = [f"{name} ({len(part)})" for name, part in work.places.items()]
     trainings = settings.seeds * len(settings.compared)
     lines = [

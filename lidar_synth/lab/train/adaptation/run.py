@@ -119,6 +119,7 @@ def plan_adaptation(
     minutes: float = MINUTES,
     sensor: str | Path | Sensor | None = None,
     town: int = TOWN_SCANS,
+    **reading: Any,
 ) -> AdaptPlan:
     """The plan of an adaptation; the arguments and errors are those of ``adapt``."""
     out = Path(out)
@@ -135,8 +136,8 @@ def plan_adaptation(
         )
     start = load_checkpoint(find_model(model))
     check_movable(start.header)
-    layout = layout_of(root)
-    source = open_scans(root, sensor=sensor, layout=layout)
+    layout = reading.pop("layout", None) or layout_of(root)
+    source = open_scans(root, sensor=sensor, layout=layout, **reading)
     parts = split(source.ids)
     first = source[0]
     labelled = first.label is not None
@@ -182,6 +183,7 @@ def adapt(
     town: int = TOWN_SCANS,
     overrides: Mapping[str, Mapping[str, Any]] | None = None,
     progress: bool = True,
+    **reading: Any,
 ) -> Path:
     """Adapt a model to the sensor and the streets of 20 to 200 scans.
 
@@ -203,6 +205,7 @@ def adapt(
             that yours lack; 0 = none.
         overrides: {name of a stage: values of its recipe}.
         progress: show bars.
+        reading: further options of ``open_scans``.
 
     Returns:
         The path of the checkpoint, for ``load_generator``.
@@ -222,7 +225,7 @@ def adapt(
         ...     print(str(error).split(";")[0])
         3 scans
     """
-    plan = plan_adaptation(model, scans, out, minutes, sensor, town)
+    plan = plan_adaptation(model, scans, out, minutes, sensor, town, **reading)
     require_accelerate()
     claim(plan.work / SETTINGS, _settings(plan))
     prepared = prepare(
