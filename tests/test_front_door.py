@@ -180,6 +180,8 @@ def test_labelled_scans_are_compared_and_mixed(tmp_path: Path) -> None:
 
 def test_scans_with_boxes_get_the_town_with_boxes(tmp_path: Path) -> None:
     MAKERS["kitti_object"](tmp_path / "scans")
+    points = sorted((tmp_path / "scans" / "training" / "velodyne").iterdir())[-1]
+    shutil.copy(points, points.with_name("000099.bin"))  # without boxes
     given = {"scans": 1, "minutes": 0, "jobs": 1, "trainer": "lightning"}
     made = lidar_synth.start(tmp_path / "scans", tmp_path / "out", **given)
     assert made is not None and "your objects pasted" in made.found[4]
@@ -188,7 +190,8 @@ def test_scans_with_boxes_get_the_town_with_boxes(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no box with 5 points"):
         exec(script, {})  # the random boxes hold no objects that could be pasted
     assert 'task="detection"' in made.code and ".with_boxes()" in made.code
-    assert "in 0 of 3 scans looked at" in made.found[1]
+    assert made.found[0].startswith("scans    4 ")
+    assert "in 0 of 4 scans looked at" in made.found[1]
     assert "in unknown drives" in made.found[0] and "for 30 of 40" in made.found[4]
     town = lidar_synth.open_scans(tmp_path / "out" / "town")
     assert len(town) == 1 and town[0].boxes is not None and town[0].label is not None

@@ -103,8 +103,7 @@ def test_every_scan_of_a_long_source_is_of_a_place(
     assert find_places(SOURCES["pose"], "pose") == {
         "00, place 1": [0, 1, 2, 3],
         "00, place 2": [4, 5],
-        "00, place 3": [6, 7],
-        "00, place 4": [8],
+        "00, place 3": [6, 7, 8],
     }
 
 

@@ -24,9 +24,7 @@ def require_outside(out: Path, root: Path) -> None:
     Raises:
         ConfigError: if ``out`` is ``root`` or lies in it.
     """
-    out = out.resolve()
-    root = root.resolve()
-    if root in (out, *out.parents):
+    if out.resolve().is_relative_to(root.resolve()):
         raise ConfigError(f"--out {out} inside of {root}", "a folder outside of it")
 
 
