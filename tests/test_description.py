@@ -272,7 +272,7 @@ def test_a_damaged_description_is_refused(tmp_path: Path, values: Any) -> None:
     for options in ({}, {"sensor": "os1_128"}):
         with pytest.raises(
             DataError,
-            match=f"{NAME} is damaged .*; expected a description.* remove it .* and name",
+            match=f"{NAME} is damaged .*; expected a description.* or yours.* and name",
         ):
             open_scans(tmp_path / "in", **options)  # type: ignore[arg-type]
     with pytest.raises(DataError, match=f"{NAME} is damaged"):

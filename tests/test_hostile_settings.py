@@ -68,7 +68,7 @@ TABLE = {
         (LINEAR | {"description": [1]}, "expected text"),
         (LINEAR | {7: 7}, r"sensor keys \[7\]"),
         ({"columns": 64}, "without range_min, range_max"),
-        ("text", "holds dict; expected a mapping from a sensor's name"),
+        ("text", r"does not hold sensors by name \(dict\); expected NAME: "),
     ],
 )
 def test_invalid_sensors_are_refused(

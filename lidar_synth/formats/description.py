@@ -249,7 +249,7 @@ def _is_dataset(folder: Path) -> bool:
 
 
 def _current(path: Path) -> Description:
-    expected = f"a description of scans that this package wrote ({FORMAT})"
+    expected = f"a description of scans, of this package or yours ({FORMAT})"
     try:
         return Description.from_dict(
             parse_json(read_text(path, expected, LONGEST), str(path), expected)

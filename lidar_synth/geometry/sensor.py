@@ -456,8 +456,8 @@ def _entries(values: Any, where: str) -> dict[Any, dict[str, Any]]:
         isinstance(v, dict) for v in values.values()
     ):
         raise ConfigError(
-            f"{where} holds {type(values).__name__}",
-            "a mapping from a sensor's name to its values",
+            f"{where} does not hold sensors by name ({type(values).__name__})",
+            "NAME: {rows: 64, ...}, a sensor's name with its values below it",
         )
     return values
 
