@@ -25,7 +25,7 @@ from lidar_synth.lab.proof import Trainer, reference
 from lidar_synth.lab.proof.arms import ARMS
 from lidar_synth.lab.proof.scores import interval
 
-ARM = ["pretrain-generator"]
+ARM = ["recipe"]
 
 
 def halves(root: Path, out: Path) -> list[tuple[Path, Path]]:
@@ -88,7 +88,7 @@ def draw(records: Sequence[dict[str, Any]], base: dict[str, Any], path: Path) ->
 
 def plot(axes: Any, found: dict[str, dict[int, float]]) -> None:
     """Curves of two arms over the labelled frames; a line for the training without a label."""
-    for arm in ("pretrain-generator", "real"):
+    for arm in ("recipe", "real"):
         means = dict(sorted(found.get(arm, {}).items()))
         axes.plot(means.keys(), means.values(), "o-", label=ARMS[arm].title)
     for mean in found.get("alone", {}).values():
