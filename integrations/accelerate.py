@@ -22,7 +22,6 @@ from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.mixing import MixedBatches, MixedStream
-from lidar_synth.mixing.state import take_state
 
 try:
     from accelerate.data_loader import DataLoaderShard, prepare_data_loader
@@ -82,7 +81,9 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
         dispatch_batches=False,
     )
     shard = _Prepared(made, divided)
-    take_state(loader, shard)
+    vars(loader).update(
+        state_dict=shard.state_dict, load_state_dict=shard.load_state_dict
+    )
     return shard
 
 
@@ -90,7 +91,7 @@ class _Prepared(DataLoaderShard):  # type: ignore[misc]
     """Accelerate's loader, which counts the batches that it has yielded: it fetches one ahead."""
 
     def __init__(self, made: Any, divided: MixedBatches | MixedStream) -> None:
-        self.__dict__.update(made.__dict__)
+        self.__dict__ |= vars(made)
         self._divided = divided
         mixed = divided.scans if isinstance(divided, MixedStream) else divided.dataset
         self._current = mixed.current

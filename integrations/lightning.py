@@ -23,7 +23,7 @@ from lidar_synth.geometry.scan import Source
 from lidar_synth.mixing import Collate, MixedBatches, MixedScans, to_item
 from lidar_synth.mixing.batches import CutSteps, cut_steps
 from lidar_synth.mixing.service.batches import Places, complete
-from lidar_synth.mixing.state import after_epoch, check_state, make_state, take_state
+from lidar_synth.mixing.state import after_epoch, check_state, make_state
 from lidar_synth.noise import keyed_rng
 
 try:
@@ -120,15 +120,14 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             self._resume = None
         dataset: Any = Places(self.train) if self.on_device else self.train
         collate = Unfinished if self.on_device else self.train.collate
-        return take_state(
-            DataLoader(
-                dataset,
-                batch_sampler=self._batches,
-                collate_fn=collate,
-                **self._workers(),
-            ),
-            self._batches,
+        loader: Any = DataLoader(
+            dataset, batch_sampler=self._batches, collate_fn=collate, **self._workers()
         )
+        vars(loader).update(  # Lightning saves it
+            state_dict=self._batches.state_dict,
+            load_state_dict=self._batches.load_state_dict,
+        )
+        return loader
 
     def teardown(self, stage: str) -> None:
         """Set the mixture back to its first epoch, in which another training begins."""

@@ -221,12 +221,12 @@ class MixedBatches(Divided, Sampler[list[int]]):
         steps = self._steps()
         epoch = self.dataset.epoch
         mixture = self.dataset.mixture
-        taken = self._taken[1] if self._taken[0] == epoch else 0
-        if done is None and taken >= len(steps):
-            # Not the next epoch yet: a trainer that resumes here still has to see the end of this
-            # one.
-            return make_state(mixture, epoch, len(self.dataset))
-        done = taken if done is None else done
+        if done is None:
+            done = self._taken[1] if self._taken[0] == epoch else 0
+            if done >= len(steps):
+                # Not the next epoch yet: a trainer that resumes here still has to see the end of
+                # this one.
+                return make_state(mixture, epoch, len(self.dataset))
         return make_state(mixture, *after_batches(mixture, epoch, steps, done))
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -86,8 +86,9 @@ class CurrentEpoch:
         self._fetched = shared_integers(*[0] * _COUNTERS)
         self.passed: dict[int, tuple[int, int]] = {}
         """By rank: epoch and position where its latest complete pass by ``batches`` began."""
-        # The epoch that this process set, or the current epoch when this process started.
-        self._own = 0
+        self.at_start = 0
+        """The epoch that this process set, or that was current when it started: for a worker, at
+        ``iter(loader)``."""
         self._process = os.getpid()
         # {fetcher: epoch of its pass}.
         self._passes: WeakKeyDictionary[Any, int] = WeakKeyDictionary()
@@ -101,12 +102,6 @@ class CurrentEpoch:
         """Number of positions with an epoch that all workers together have fetched."""
         return int(self._fetched.sum())
 
-    @property
-    def at_start(self) -> int:
-        """The epoch that this process set, or that was current when it started: for a worker, at
-        ``iter(loader)``."""
-        return self._own
-
     def set(self, epoch: int) -> None:
         """Set the epoch for all processes.
 
@@ -115,16 +110,21 @@ class CurrentEpoch:
                 never used.
         """
         unused = self._shared[3] == 0
-        if epoch < self._own and unused and not self._followers and count_accelerated():
+        if (
+            epoch < self.at_start
+            and unused
+            and not self._followers
+            and count_accelerated()
+        ):
             raise ConfigError(
-                f"epoch {epoch} where epoch {self._own} was set or resumed: a loader of "
+                f"epoch {epoch} where epoch {self.at_start} was set or resumed: a loader of "
                 "accelerator.prepare counts its passes from 0",
                 "the epoch that was set or resumed",
                 "from lidar_synth.integrations.accelerate import prepare; loader = "
                 "prepare(accelerator, loader).",
             )
         self._shared[0] = epoch
-        self._own = epoch
+        self.at_start = epoch
         self._shared[3] = 0
         for loader in self._followers:
             loader.iteration = epoch
@@ -157,7 +157,7 @@ class CurrentEpoch:
             self._passes.clear()
         if fetcher not in self._passes:
             check_whole(fetcher.dataset)
-            self._passes[fetcher] = self._own if forked else epoch
+            self._passes[fetcher] = self.at_start if forked else epoch
             self.note_pass(self._passes[fetcher])
         check_pass(self._passes[fetcher], epoch)
         return epoch

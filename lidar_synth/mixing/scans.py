@@ -223,8 +223,9 @@ class MixedScans(Dataset[Any]):
         self._untold = False
         self.set_epoch(0)
         self._untold = self._take_earlier()
-        weighs = self.synthetic_weight != make_weight(1)
-        self._weighs = compare and (weighs or set(self._loss_weights) != {1})
+        self._weighs = compare and (
+            self.synthetic_weight != make_weight(1) or set(self._loss_weights) != {1}
+        )
         if real_as_is and compare:
             check_alike(self.real, self.synthetic, self._maker.synthetic)
 

@@ -100,14 +100,6 @@ def make_state(mixture: Mixture, epoch: int, position: int) -> dict[str, Any]:
     }
 
 
-def take_state(loader: Any, progress: Any) -> Any:
-    """The loader, whose state is now that of what counts its batches."""
-    vars(loader).update(
-        state_dict=progress.state_dict, load_state_dict=progress.load_state_dict
-    )
-    return loader
-
-
 def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
     """Epoch and position after an epoch: the beginning of the next, or the same epoch's end if it
     was the last."""
