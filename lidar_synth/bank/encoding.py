@@ -1,15 +1,16 @@
 """Encoding of range images: 3 to 5 bytes per cell, the same bytes on every machine.
 
-=========== ======
-================================================================================================
-array       type   value =========== ======
-================================================================================================
-range       uint16 metres = value * scale, scale = the sensor's range_max / 65535 (1.2 mm for 80 m);
-0 = no return reflectance uint8  value / 255 label       uint8  train ids 0..18, 255 = ignore
-confidence  uint8  value / 15: four bits are precise enough for a confidence instance    uint16 the
-instance of the point's box; 0 = none boxes       int32  (256, 9) for each scan, see ``boxes``
-=========== ======
-================================================================================================
+=========== ====== ==================================================================
+array       type   value
+=========== ====== ==================================================================
+range       uint16 metres = value * scale, scale = the sensor's range_max / 65535
+                   (1.2 mm for 80 m); 0 = no return
+reflectance uint8  value / 255
+label       uint8  train ids 0..18, 255 = ignore
+confidence  uint8  value / 15: four bits are precise enough for a confidence
+instance    uint16 the instance of the point's box; 0 = none
+boxes       int32  (256, 9) for each scan, see ``boxes``
+=========== ====== ==================================================================
 
 ``encode`` rounds by at most half a step, and ``encode(decode(x)) == x``. Every return stays a
 return: a range below half a step is stored as 1, not as 0, and decoded ranges stay within the
