@@ -572,6 +572,17 @@ def test_an_array_job_bakes_its_share(
         CliRunner().invoke(app, call, catch_exceptions=False)
 
 
+def test_some_tasks_of_an_array_are_no_shares(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As --array=1,2 starts them; they would bake the shares of an array of two."""
+    for name, value in {"ID": "1", "COUNT": "2", "MAX": "2"}.items():
+        monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", value)
+    call = ["bake", str(tmp_path / "bank"), "--shard-index", "auto"]
+    with pytest.raises(ConfigError, match="'1' of --num-shards ''.*--num-shards 16"):
+        CliRunner().invoke(app, call, catch_exceptions=False)
+
+
 def test_unsuitable_models_are_refused(tmp_path: Path) -> None:
     plain = write(tmp_path / "plain.safetensors", ("range", "reflectance"))
     with pytest.raises(

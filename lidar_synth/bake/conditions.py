@@ -87,7 +87,7 @@ def open_conditions(
         ConfigError: on a layout or a split without a path, and as ``open_scans``.
         FileError, DataError: as ``open_scans``.
     """
-    if path is not None:
+    if path:
         layouts = LayoutFiles(Path(path))
         others = _others(Path(path))
         if len(layouts) and not (layout or split or others):
@@ -100,7 +100,7 @@ def open_conditions(
             raise DataError(
                 f"{error} For layouts: {others[0]} is none; move it elsewhere."
             ) from error
-    if layout is not None or split is not None:
+    if layout or split:
         raise ConfigError(
             f"conditions of layout {layout} and split {split}, but no dataset",
             "--condition PATH",

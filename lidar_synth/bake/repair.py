@@ -104,8 +104,12 @@ def _mend(
         file: "rewritten from the index" for file, _ in check_side_files(folder, index)
     }
     shards = list(index.shards)
-    total = sum(entry.scans for entry in shards)
-    with tqdm(total=total, desc="repair", unit="scan", disable=not progress) as bar:
+    with tqdm(
+        total=sum(entry.scans for entry in shards),
+        desc="repair",
+        unit="scan",
+        disable=not progress,
+    ) as bar:
         for number, entry in enumerate(shards):
             facts = index.sources[entry.source]
             if entry.sha256 and next(check_shard(folder, facts, entry), None) is None:

@@ -66,8 +66,12 @@ def verify(root: str | Path, progress: bool = True) -> list[Problem]:
     folder = open_folder(root)
     index = read_index(bank_root(root))
     problems: list[Problem] = []
-    total = sum(entry.scans for entry in index.shards)
-    with tqdm(total=total, desc="verify", unit="scan", disable=not progress) as bar:
+    with tqdm(
+        total=sum(entry.scans for entry in index.shards),
+        desc="verify",
+        unit="scan",
+        disable=not progress,
+    ) as bar:
         for entry in index.shards:
             problems += check_shard(folder, index.sources[entry.source], entry)
             bar.update(entry.scans)

@@ -153,6 +153,9 @@ def _share(index: str, number: int | None) -> "Share":
         index = os.environ[found[0]]
         if number is None:
             size = os.environ.get(_ARRAYS[found[0]], "")
+            # of an array such as 1,2 or 1-4, the number of a task is not that of a share
+            if int(os.environ.get("SLURM_ARRAY_TASK_MAX", "0")) >= int(size or "1"):
+                size = ""
     if not (index.isdigit() and size.lstrip("-").isdigit()):
         raise ConfigError(
             f"--shard-index {index!r} of --num-shards {size!r}",
