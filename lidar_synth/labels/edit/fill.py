@@ -129,19 +129,17 @@ def _fill(ring, donor, out):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True)
 def _fill_hole(ring, first, length, donor, out):  # type: ignore[no-untyped-def]
     """Fill the hole of some rays from the first on."""
-    count = len(ring.hole)
-    limit = np.inf
-    for k in range(length):
-        limit = min(limit, ring.near[(first + k) % count])
+    rays = (first + np.arange(length)) % len(ring.hole)
+    limit = ring.near[rays].min()
     left = _side(ring, first - 1, -1, limit)
-    right = _side(ring, (first + length) % count, 1, limit)
+    right = _side(ring, first + length, 1, limit)
     # from the middle to the middle of the averaged rays
     turn = (length + 1 + 2 * _SMOOTH) * ring.step
     same = _one_surface(ring, left, right, turn)
     for k in range(length):
         share = (k + 1 + _SMOOTH) * ring.step / turn
         between = _between(left, right, turn, share) if same else 0.0
-        ray = (first + k) % count
+        ray = rays[k]
         if len(left.rays) and (share < 0.5 or not len(right.rays)):
             donor[ray], out[ray] = _estimate(
                 ring, left, right, k, between, ring.far[ray]
