@@ -41,7 +41,14 @@ def turn_bank(
         DataError, FileError: if a scan cannot be read, cast or written.
     """
     with claim_bank(out, {"bank": bank.identity, "as_sensor": transfer.identity}):
-        sources = tuple(_facts(facts, transfer) for facts in bank.index.sources)
+        sources = tuple(
+            replace(
+                facts,
+                sensor=transfer.target,
+                settings=facts.settings | {"as_sensor": transfer.identity},
+            )
+            for facts in bank.index.sources
+        )
         entries = []
         with tqdm(total=len(bank), unit="scan", disable=not progress) as bar:
             for number, entry in enumerate(bank.index.shards):
@@ -52,14 +59,6 @@ def turn_bank(
         return write_bank_files(
             out, Index(sources, tuple(entries), curation=bank.index.curation)
         )
-
-
-def _facts(facts: Facts, transfer: Transfer) -> Facts:
-    return replace(
-        facts,
-        sensor=transfer.target,
-        settings=facts.settings | {"as_sensor": transfer.identity},
-    )
 
 
 def _shard(

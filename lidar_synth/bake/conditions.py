@@ -55,10 +55,15 @@ class LayoutFiles:
 
     Args:
         path: a file, or a folder of them.
+
+    Attributes:
+        others: the file, or visible entries of the folder, that are no YAML files.
     """
 
     def __init__(self, path: Path) -> None:
-        self._files = [path] if path.is_file() else sorted(path.glob("[!.]*.y*ml"))
+        given = [path] if path.is_file() else sorted(path.glob("[!.]*"))
+        self._files = [file for file in given if file.suffix in (".yaml", ".yml")]
+        self.others = [file for file in given if file not in self._files]
         self.ids = [file.stem for file in self._files]
 
     def __len__(self) -> int:
@@ -89,16 +94,15 @@ def open_conditions(
     """
     if path:
         layouts = LayoutFiles(Path(path))
-        others = _others(Path(path))
-        if len(layouts) and not (layout or split or others):
+        if len(layouts) and not (layout or split or layouts.others):
             return layouts
         try:
             return open_scans(path, layout=layout, split=split)
         except DataError as error:
-            if not (others and len(layouts)):
+            if not (layouts.others and len(layouts)):
                 raise
             raise DataError(
-                f"{error} For layouts: {others[0]} is none; move it elsewhere."
+                f"{error} For layouts: {layouts.others[0]} is none; move it elsewhere."
             ) from error
     if layout or split:
         raise ConfigError(
@@ -106,12 +110,6 @@ def open_conditions(
             "--condition PATH",
         )
     return None
-
-
-def _others(path: Path) -> list[Path]:
-    """A file, or the visible ones of a folder, that are no YAML files."""
-    files = [path] if path.is_file() else sorted(path.glob("[!.]*"))
-    return [file for file in files if file.suffix not in (".yaml", ".yml")]
 
 
 def conditions_for(

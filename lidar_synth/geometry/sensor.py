@@ -197,7 +197,7 @@ class Sensor:
             )
             values = [_plain(value) for value in table] if is_list else []
             if key == "azimuths":
-                values = [None if _is_nan(value) else value for value in values]
+                values = [None if v != v else v for v in values]  # NaN
             numbers = [
                 value for value in values if not (key == "azimuths" and value is None)
             ]
@@ -440,10 +440,6 @@ def _is_finite(value: object) -> bool:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     # isfinite fails on very large integers.
     return bool(is_number and -1e300 < value < 1e300)  # type: ignore[operator]
-
-
-def _is_nan(value: object) -> bool:
-    return isinstance(value, float) and value != value
 
 
 def _is_integer(value: object) -> bool:

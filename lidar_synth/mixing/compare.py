@@ -66,6 +66,7 @@ def check_alike(
     real: Sequence[Any],
     synthetic: Sequence[Synthetic],
     finish: Callable[[int, Scan, np.random.Generator], Any],
+    weighs: bool = False,
 ) -> None:
     """Compare a trainer's first sample with one synthetic sample of each source, then what several
     samples mean.
@@ -83,6 +84,8 @@ def check_alike(
         real: the trainer's datasets; the first sample of the first one is used.
         synthetic: the sources.
         finish: ``(source, scan, rng) -> sample``, what the mixture does to a scan of a source.
+        weighs: whether samples have weights in the loss, which only a dict with ``loss_weight``
+            gets.
 
     Raises:
         ConfigError: if keys, types, dtypes, ranks or the value for "ignore" differ, or units, axes,
@@ -114,8 +117,19 @@ def check_alike(
                     "Change to_sample, or pass compare=False if the collate function expects "
                     "them to differ.",
                 )
+            if weighs and not (isinstance(sample, dict) and "loss_weight" in sample):
+                raise weightless()
             if _tables(expected) and not _is_on_demand(source):
                 _compare_more(dataset, expected, source, make)
+
+
+def weightless() -> ConfigError:
+    """The error for samples that a weight has no place in."""
+    return ConfigError(
+        "loss_weight for samples without the key loss_weight",
+        "dicts with it, in which the weight of the plan is written",
+        "If you multiply by train.loss_weight(i), pass compare=False.",
+    )
 
 
 def _compare_more(

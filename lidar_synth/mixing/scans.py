@@ -21,7 +21,7 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
-from lidar_synth.mixing.compare import check_alike
+from lidar_synth.mixing.compare import check_alike, weightless
 from lidar_synth.mixing.domains import make_weight
 from lidar_synth.mixing.epochs import CurrentEpoch, Position
 from lidar_synth.mixing.items import to_item
@@ -227,7 +227,7 @@ class MixedScans(Dataset[Any]):
             self.synthetic_weight != make_weight(1) or set(self._loss_weights) != {1}
         )
         if real_as_is and compare:
-            check_alike(self.real, self.synthetic, self._maker.synthetic)
+            check_alike(self.real, self.synthetic, self._maker.synthetic, self._weighs)
 
     def _take_earlier(self) -> bool:
         """Take the pass of the latest mixture with the same plan, if there is one."""
@@ -461,11 +461,7 @@ class MixedScans(Dataset[Any]):
         if isinstance(sample, dict) and "loss_weight" in sample:
             sample["loss_weight"] = self._weight_of(plan, position)
         elif self._weighs:
-            raise ConfigError(
-                "loss_weight for samples without the key loss_weight",
-                "dicts with it, in which the weight of the plan is written",
-                "If you multiply by train.loss_weight(i), pass compare=False.",
-            )
+            raise weightless()
         return sample
 
     def epoch_of(self, index: int) -> int:

@@ -99,7 +99,13 @@ def html_page(
         "domains": list(domains),
         "classes": [*NAMES, "unlabelled"],
         "scales": {
-            name: _scale_data(scale, row)
+            name: {
+                "title": scale.title,
+                "row": row,
+                "low": scale.low,
+                "high": scale.high,
+                "gamma": scale.gamma,
+            }
             for row, (name, scale) in enumerate(colours.items())
         },
         "table": _base64(
@@ -136,16 +142,6 @@ def html_page(
 
 def _resource(name: str) -> str:
     return files("lidar_synth.viz").joinpath(name).read_text(encoding="utf-8")
-
-
-def _scale_data(scale: Scale, row: int) -> dict[str, Any]:
-    return {
-        "title": scale.title,
-        "row": row,
-        "low": scale.low,
-        "high": scale.high,
-        "gamma": scale.gamma,
-    }
 
 
 def _scan_data(view: View, colours: dict[str, Scale]) -> dict[str, Any]:

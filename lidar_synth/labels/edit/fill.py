@@ -140,14 +140,12 @@ def _fill_hole(ring, first, length, donor, out):  # type: ignore[no-untyped-def]
         share = (k + 1 + _SMOOTH) * ring.step / turn
         between = _between(left, right, turn, share) if same else 0.0
         ray = rays[k]
-        if len(left.rays) and (share < 0.5 or not len(right.rays)):
+        of_left = len(left.rays) and (share < 0.5 or not len(right.rays))
+        side, other = (left, right) if of_left else (right, left)
+        if len(side.rays):
+            nth = k if of_left else length - 1 - k
             donor[ray], out[ray] = _estimate(
-                ring, left, right, k, between, ring.far[ray]
-            )
-        elif len(right.rays):
-            nth = length - 1 - k
-            donor[ray], out[ray] = _estimate(
-                ring, right, left, nth, between, ring.far[ray]
+                ring, side, other, nth, between, ring.far[ray]
             )
 
 
