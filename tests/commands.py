@@ -155,7 +155,8 @@ def _bake(values: dict[str, Any], folder: Path | None) -> None:
         if key in BakeJob.model_fields and value is not None
     }
     validate(BakeJob, settings, "bake")
-    _one_of("engine", (*ENGINES,))(values, folder)
+    if values["engine"] is not None:
+        _one_of("engine", (*ENGINES,))(values, folder)
 
 
 def _one_of(

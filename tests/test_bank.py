@@ -311,7 +311,7 @@ def test_a_paged_bank_reads_over_a_network(tmp_path: Path) -> None:
     scans = open_scans("memory://remote")
     for a, b in zip(scans, open_scans(tmp_path / "bank"), strict=True):
         assert np.array_equal(a.points, b.points)
-    with pytest.raises(FileError, match="memory://nowhere/index.json cannot be read"):
+    with pytest.raises(FileError, match="memory://nowhere holds no bank"):
         open_scans("memory://nowhere")
     with pytest.raises((FileError, LibraryError), match="nosuch://"):
         Bank("nosuch://bank")
