@@ -196,7 +196,8 @@ def test_an_unknown_protocol_is_a_wrong_call(folders: tuple[Path, Path]) -> None
     result = CliRunner().invoke(
         app, ["evaluate", *map(str, folders), "--protocol", "frid"]
     )
-    assert isinstance(result.exception, ConfigError)  # exit status 2
+    error = result.exception  # exit status 2
+    assert isinstance(error, ConfigError) and "--protocol 'frid'" in str(error)
 
 
 def trained_on(folder: Path, seen: Recordings) -> None:

@@ -107,16 +107,16 @@ def test_every_field_of_a_point_is_read_back(tmp_path: Path, to: str) -> None:
     scan.confidence = (np.arange(len(scan), dtype=np.float32) / len(scan)).astype(
         np.float32
     )
+    scan.time = scan.confidence / np.float32(10)
     assert scan.raw_label is not None
     scan.raw_label = scan.raw_label | np.uint32(1 << 31)
     write_all(to, tmp_path, [scan])
     read = back(to, tmp_path)[0]
     assert set(read.fields()) == set(scan.fields())
     for name, values in scan.fields().items():
-        assert (
-            same(read.fields()[name], values)
-            and read.fields()[name].dtype == values.dtype
-        ), name
+        found = read.fields()[name]
+        assert same(found, values) and found.dtype == values.dtype, name
+        assert found.flags.writeable, name
 
 
 @pytest.mark.parametrize(

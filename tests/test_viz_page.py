@@ -96,8 +96,11 @@ def test_one_far_point_leaves_the_others_where_they_are(scans: list[Scan]) -> No
     scan = scans[0]
     points = scan.points.copy()
     points[0, 0] = 65535
-    _, metres = pack(replace(scan, points=points))
-    assert metres <= 4 * scan.sensor.range_max / 32767
+    packed, metres = pack(replace(scan, points=points))
+    steps = np.frombuffer(zlib.decompress(packed), "<i2", len(scan))
+    x = np.cumsum(steps, dtype=np.int16) * metres
+    assert metres <= 4 * scan.sensor.range_max / 32767 <= x[0]
+    assert np.abs(x[1:] - points[1:, 0]).max() <= metres
 
 
 def test_labels_of_any_integers_are_packed_as_bytes(scans: list[Scan]) -> None:

@@ -63,7 +63,7 @@ class LayoutFiles:
     def __init__(self, path: Path) -> None:
         given = [path] if path.is_file() else sorted(path.glob("[!.]*"))
         self._files = [file for file in given if file.suffix in (".yaml", ".yml")]
-        self.others = [file for file in given if file not in self._files]
+        self.others = [file for file in given if file.suffix not in (".yaml", ".yml")]
         self.ids = [file.stem for file in self._files]
 
     def __len__(self) -> int:
@@ -102,7 +102,8 @@ def open_conditions(
             if not (layouts.others and len(layouts)):
                 raise
             raise DataError(
-                f"{error} For layouts: {layouts.others[0]} is none; move it elsewhere."
+                f"{path} holds layouts and {layouts.others[0].name}",
+                "layouts only, or a dataset",
             ) from error
     if layout or split:
         raise ConfigError(

@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
@@ -171,13 +171,17 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
             "Give its file with --model.",
         )
     wanted = (facts.condition or {}).get("content")
-    found = None
-    with suppress(LidarSynthError):
+    why = ""
+    try:
         found = fingerprint(_source(job))
+    except LidarSynthError as error:
+        found = None
+        why = f" ({error})"
     if wanted not in (None, found):
         open_conditions.cache_clear()  # they may be restored
         raise ConfigError(
-            f"conditions {job.condition}, which have moved or changed since the bank was begun",
+            f"conditions {job.condition}{why}, which have moved or changed since the bank was "
+            "begun",
             "the files, or the names of scans, of its first shard",
             "Restore them, name their dataset with --condition, or bake into another folder.",
         )

@@ -245,7 +245,7 @@ def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         n: stored[n].astype(TYPES[n]) for n in own
     }
     named = {"ring": _first(stored, RINGS), "time": _first(stored, TIMES)}
-    return arrays | {n: values for n, values in named.items() if values is not None}
+    return arrays | {n: np.array(a) for n, a in named.items() if a is not None}
 
 
 def _first(

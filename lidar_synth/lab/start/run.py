@@ -428,7 +428,7 @@ def _configure(plan: StartPlan, trainer: str) -> dict[str, str]:
     if changing and trainer != "lightning":
         layout = "kitti_object" if task == "detection" else "semantic_kitti"
         raise ConfigError(
-            f"--trainer {trainer}, which reads the files itself, with {', '.join(changing)}",
+            f"{', '.join(sorted(changing))} with --trainer {trainer}, which reads the files itself",
             "files that need no such options",
             f"First type lidar-synth convert {root} OUT --to {layout} with them.",
         )

@@ -318,4 +318,5 @@ def _settings(plan: AdaptPlan) -> dict[str, Any]:
         "ids": hash_of_names([plan.source.ids[i] for i in indices]),
         "sensor": plan.sensor.to_dict(),
         "town": plan.town,
+        **plan.source.options,
     }
