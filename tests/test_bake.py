@@ -206,7 +206,9 @@ def test_conditions_may_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert verify(out, progress=False) == []
         facts = Bank(out).facts
         assert (facts.condition or {})["source"] == facts.settings["condition"] == known
-        with pytest.raises(ConfigError, match="real .*, which have moved .*--condition"):
+        with pytest.raises(
+            ConfigError, match="real .*, which have moved .*--condition"
+        ):
             regenerate(out, str(model), progress=False)
         again = regenerate(out, str(model), progress=False, condition="../moved")
         assert min(again.values()) == 1
