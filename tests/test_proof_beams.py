@@ -8,9 +8,10 @@ import pytest
 from proofs import TOWN_SENSOR, drives
 from typer.testing import CliRunner
 
-from lidar_synth import ProofSettings, Town, load_sensor
+from lidar_synth import ProofSettings, Town, load_sensor, open_scans
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError
+from lidar_synth.formats import WRITERS
 from lidar_synth.geometry.projection import locate
 from lidar_synth.lab.proof.beams import coarser, keep_beams
 from lidar_synth.lab.proof.planning import make_plan
@@ -73,6 +74,19 @@ def test_all_scans_of_a_plan_and_its_pools_are_of_the_coarser_sensor(
     task = PoolTask("town", tmp_path, plan.sensor, plan.grid, 1)
     made = read_pool(make_pool(task))
     assert made[0].sensor.shape == (8, 64) and len(made[0]) > 100
+
+
+def test_a_comparison_knows_how_its_scans_were_read(tmp_path: Path) -> None:
+    writer = WRITERS["semantic_kitti"](tmp_path)
+    for index, scan in enumerate(drives()):
+        writer.write(scan, index)
+    settings = replace(SMALL, places="stretch")
+    one, other = (
+        make_plan(open_scans(tmp_path, **options), settings, None, 1)[0].identity()
+        for options in ({}, {"reflectance_max": 2.0})
+    )
+    assert "reflectance_max" not in one
+    assert other == one | {"reflectance_max": 2.0}
 
 
 @pytest.mark.parametrize("beams", [5, 0, -4, 64, 2])

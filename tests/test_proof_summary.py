@@ -56,6 +56,8 @@ def a_plan(arms: list[Row], names: list[str], seeds: int = 1) -> ProofPlan:
         0.1,
         1.0,
         1,
+        "cpu",
+        {},
     )
 
 

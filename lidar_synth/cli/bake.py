@@ -153,9 +153,13 @@ def _share(index: str, number: int | None) -> "Share":
         index = os.environ[found[0]]
         if number is None:
             size = os.environ.get(_ARRAYS[found[0]], "")
-            # of an array such as 1,2 or 1-4, the number of a task is not that of a share
-            if int(os.environ.get("SLURM_ARRAY_TASK_MAX", "0")) >= int(size or "1"):
-                size = ""
+            last = int(os.environ.get("SLURM_ARRAY_TASK_MAX", "-1"))
+            if size.isdigit() and last >= int(size):
+                raise ConfigError(
+                    f"a Slurm array of {size} tasks up to {last}",
+                    "tasks from 0 without gaps, such as --array=0-15",
+                    "For a part of them, give --num-shards as well.",
+                )
     if not (index.isdigit() and size.lstrip("-").isdigit()):
         raise ConfigError(
             f"--shard-index {index!r} of --num-shards {size!r}",

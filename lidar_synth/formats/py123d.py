@@ -144,7 +144,7 @@ class Py123D(ScanFiles):
         frame = self._frames[index]
         path = frame.folder / f"{frame.lidar}.arrow"
         row, facts = _row(frame, frame.lidar)
-        mounts = _mounts(path)
+        mounts = _mounts(facts)
         number = self.options["lidar"]
         if number is None:
             number = TOP if TOP in mounts else min(mounts)
@@ -185,10 +185,8 @@ class Py123D(ScanFiles):
         return drop_nearest(scan, path) if frame.dataset == "nuscenes" else scan
 
 
-def _mounts(path: Path) -> dict[int, dict[str, Any]]:
+def _mounts(facts: dict[Any, Any]) -> dict[int, dict[str, Any]]:
     """The sensors of a file of clouds by their numbers: of a merged one, or of one sensor."""
-    with _opened(path) as table:
-        facts = _facts(table)
     if "lidar_id" in facts:
         return {facts["lidar_id"]: facts}
     return {int(number): mount for number, mount in facts.items()}
@@ -203,8 +201,11 @@ def _frames(
     clouds.sort(key=lambda name: name not in (MERGED, "lidar.lidar_top"))
     if not clouds:
         return []
-    if lidar is not None:
-        clouds.sort(key=lambda name: lidar not in _mounts(folder / f"{name}.arrow"))
+    for name in clouds if lidar is not None else ():
+        with _opened(folder / f"{name}.arrow") as cloud:
+            if lidar in _mounts(_facts(cloud)):
+                clouds = [name]
+                break
     numbers = enumerate(columns[clouds[0]])
     return [
         (n, Frame(folder, dataset, clouds[0], {k: v[n] for k, v in columns.items()}))

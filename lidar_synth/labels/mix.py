@@ -186,7 +186,11 @@ class _RealMix:
         bound = replace(self, real=real if self.real is None else self.real)
         policy = type(self).__name__
         first = _first_labelled(bound.real, policy)
-        if getattr(self, "objects", 0) and first.boxes is None is first.instance:
+        if (
+            getattr(self, "objects", 0)
+            and first.boxes is None
+            and first.instance is None
+        ):
             raise ConfigError(
                 f"{policy} with real scans that have neither boxes nor instances",
                 "objects=0",

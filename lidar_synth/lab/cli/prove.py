@@ -159,10 +159,14 @@ def prove(
             "only": only or None,
         }
         _check_task(task, drop_missing(own | more))
-        limits = drop_missing({"minutes": minutes, "pools": pools})
         source = open_scans(root, sensor=sensor, **given)
         _prove_detection(
-            source, out, drop_missing(both), dry_run, device=device, **limits
+            source,
+            out,
+            drop_missing(both),
+            dry_run,
+            device=device,
+            **drop_missing({"minutes": minutes, "pools": pools}),
         )
         return
     settings = ProofSettings(
@@ -174,8 +178,8 @@ def prove(
     chosen = CommandTrainer(trainer) if trainer else reference
     source = open_scans(root, sensor=sensor, **given)
     # Split and layout are of ROOT.
-    alike = given | {"split": None, "layout": None}
-    others = open_scans(tests, sensor=sensor, **alike) if tests else None
+    given |= {"split": None, "layout": None}
+    others = open_scans(tests, sensor=sensor, **given) if tests else None
     if dry_run:
         jobs = jobs or usable_cores()
         plan, _ = make_plan(

@@ -49,6 +49,7 @@ class ProofPlan:
         minutes: expected for all pairs, with ``jobs`` processes.
         jobs: processes.
         device: on which the reference network computes.
+        options: how the labelled scans are read, as ``ScanFiles.options``.
     """
 
     settings: ProofSettings
@@ -69,7 +70,8 @@ class ProofPlan:
     step: float
     minutes: float
     jobs: int
-    device: str = "cpu"
+    device: str
+    options: dict[str, Any]
 
     @property
     def budget(self) -> str:
@@ -113,14 +115,14 @@ class ProofPlan:
         )
         if self.settings.beams is None:
             own.pop("beams")  # comparisons of earlier versions do not have it
-        digest = hash_of_names(self.names)
         return {
             "format": FORMAT,
-            "scans": digest,
+            "scans": hash_of_names(self.names),
             "sensor": self.sensor.name,
             "half": self.half,
             **{name: value for name, value in own.items() if name not in free},
             **({} if self.training is None else {"tested": sorted(self.places)}),
+            **self.options,
         }
 
 

@@ -122,6 +122,7 @@ def make_plan(
         0.0,
         jobs,
         device,
+        getattr(source, "options", {}),
     )
     plan = within(plan, minutes, resumed=bool(earlier))
     scans = read({i for p in plan.pairs for i in (*labelled[p], *tested[p[0]])})
