@@ -1,5 +1,4 @@
-"""From points to beams: rings from the file, from the order of the points, or from peaks of the
-elevations."""
+"""From points to beams, by their rings or by peaks of the elevations."""
 
 import logging
 from collections.abc import Sequence
@@ -8,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.lines import (
     CAP,
     Cloud,
@@ -17,10 +15,9 @@ from lidar_synth.geometry.lines import (
     refine,
     residuals,
 )
-from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.peaks import beam_peaks
+from lidar_synth.lab.fitting.points import gather, rings_of_file
 from lidar_synth.lab.fitting.search import REACH, find_motion, find_mount
 
 log = logging.getLogger(__name__)
@@ -55,26 +52,9 @@ quality."""
 GOOD_ENOUGH = 0.995
 """Quality above which they are not."""
 
-STRAY = np.radians(0.06)
-"""Points farther than this from all beams may be those of a lost one."""
-
-WINDOW = np.radians(0.025)
-"""The points of a lost beam lie within this distance of it."""
-
-LOST = 15
-"""A lost beam has at least as many points."""
-
-LOST_NEAREST = 1.5
-"""Metres; nearer points are none of a lost beam: there, a laser that stands 5 mm off leaves its
-line by 0.2 degrees."""
-
 ROUNDS = 3
 """Number of times that peaks are looked for, each time with what is known of mounting and
 motion."""
-
-ONE_TURN = (0.7, 1.3)
-"""Turns by which the azimuth changes from the first to the last point of a file in the order of
-time."""
 
 
 @dataclass(frozen=True)
@@ -90,108 +70,6 @@ class Beams:
     model: Model
     source: str
     parts: frozenset[str]
-
-
-def gather(scans: Sequence[Scan]) -> Cloud:
-    """The points of all scans, without rings; scans without ``time`` get the fraction of the turn
-    instead.
-
-    Raises:
-        DataError: without points, or with points that are not finite.
-    """
-    if not scans:
-        raise DataError("no scans", "at least one scan to fit a sensor to")
-    points = np.concatenate([scan.points for scan in scans]).astype(np.float64)
-    if not np.isfinite(points).all():
-        bad = next(scan.id for scan in scans if not np.isfinite(scan.points).all())
-        raise DataError(
-            f"scan {bad!r} with NaN or infinite points",
-            "finite metres",
-            "Read it with on_bad='drop-points'.",
-        )
-    number = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
-    timed = all(scan.time is not None for scan in scans)
-    times = [
-        np.asarray(scan.time, np.float64) if timed else turn_fraction(scan.points)
-        for scan in scans
-    ]
-    return Cloud(points, number, np.concatenate(times), np.full(len(points), -1))
-
-
-def turn_fraction(points: NDArray[np.float32]) -> Floats:
-    """(N,) fraction of the turn at which each point was measured, about -0.5 to 0.5.
-
-    The turn starts where the file does, if its points are in the order of time; otherwise behind
-    the sensor.
-    """
-    if follows_time(points):
-        unwrapped = _unwrapped(points)
-        return np.asarray(unwrapped - unwrapped.mean())
-    return np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / (2 * np.pi)
-
-
-def follows_time(points: NDArray[np.float32]) -> bool:
-    """Whether the azimuth follows the order of the points around one turn."""
-    if not len(points):
-        return False
-    unwrapped = _unwrapped(points)
-    return bool(ONE_TURN[0] < abs(unwrapped[-1]) and np.ptp(unwrapped) < ONE_TURN[1])
-
-
-def _unwrapped(points: NDArray[np.float32]) -> Floats:
-    """(N,) turns from the first point, following the order of the points."""
-    azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / (2 * np.pi)
-    step = np.diff(azimuth, prepend=azimuth[0])
-    return np.asarray(np.cumsum(step - np.round(step)))
-
-
-def _find_complete_rings(scans: Sequence[Scan]) -> list[NDArray[np.int16] | None]:
-    """The rings that follow from the order of each scan's points, of scans with all of them."""
-    found = [rings_in_order(scan.points) if len(scan) else None for scan in scans]
-    counts = [0 if ring is None else int(ring.max()) + 1 for ring in found]
-    # A scan with fewer rings is a crop; its rings have other numbers.
-    return [
-        ring if count == max(counts) else None
-        for ring, count in zip(found, counts, strict=True)
-    ]
-
-
-def rings_of_file(scans: Sequence[Scan]) -> tuple[str, NDArray[np.int64] | None]:
-    """(N,) rings that the scans have, or that follow from their order; None if there are none."""
-    if all(scan.ring is not None for scan in scans):
-        return "ring field", np.concatenate(
-            [np.asarray(scan.ring, np.int64) for scan in scans]
-        )
-    complete = _find_complete_rings(scans)
-    if sum(ring is not None for ring in complete) <= len(scans) / 2:
-        return "elevations", None
-    given = [
-        np.full(len(scan), -1) if ring is None else ring
-        for scan, ring in zip(scans, complete, strict=True)
-    ]
-    return "order of the points", np.concatenate(given).astype(np.int64)
-
-
-def rings_in_order(points: NDArray[np.float32]) -> NDArray[np.int16] | None:
-    """(N,) rings of a scan in KITTI's order of points; None if it is in another order."""
-    bounds = ring_bounds(points)
-    count = len(bounds) - 1
-    if not 4 <= count <= 512:
-        return None
-    elevation = np.degrees(
-        np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).astype(
-            np.float64
-        )
-    )
-    parts = np.split(elevation, bounds[1:-1])
-    middle = np.sort([np.median(part) for part in parts])[::-1]
-    try:
-        lasers = Sensor("rings", 2, 0.0, 1.0, elevations=tuple(middle))
-    except ConfigError:  # two rings with the same elevation
-        return None
-    if fault_of(points, bounds, lasers):
-        return None
-    return np.repeat(np.arange(count, dtype=np.int16), np.diff(bounds))
 
 
 def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud]:
@@ -453,60 +331,3 @@ def concentration(elevation: Floats, beams: Floats) -> float:
     distance = np.abs(elevation - up[ring])
     near = distance < room / 2
     return float((distance[near] < room[near] / 4).sum() / max(len(distance), 1))
-
-
-def add_lost_beams(model: Model, points: Floats) -> Model:
-    """The model with beams that have too few points to be peaks beside the others, such as those
-    that see the sky.
-
-    A beam is found among the points beyond ``STRAY`` of all others: where they lie close together,
-    with a valley between them and the next beam on either side, so that the tail of a strong beam
-    is none.
-
-    Args:
-        model: with beams in any order.
-        points: (N, 3) metres, in the sensor's frame.
-    """
-    ring = nearest_beams(points, model.tangents, model.heights)
-    rho = np.hypot(points[:, 0], points[:, 1])
-    above = points[:, 2] - model.heights[ring]
-    elevation = np.sort(np.arctan2(above, rho)[rho > LOST_NEAREST])
-    beams = list(np.arctan(model.tangents))
-    heights = list(model.heights)
-    stray = elevation[_distance(elevation, np.array(beams)) > STRAY]
-    while len(stray) >= LOST:
-        count = _count(stray, stray)
-        densest = stray[np.abs(stray - stray[int(np.argmax(count))]) < WINDOW]
-        place = float(np.median(densest))
-        if count.max() < LOST:
-            break
-        if _stands_alone(elevation, place, np.array(beams), int(count.max())):
-            heights.append(heights[int(np.abs(np.array(beams) - place).argmin())])
-            beams.append(place)
-        stray = stray[np.abs(stray - place) > STRAY]
-    return replace(model, tangents=np.tan(beams), heights=np.array(heights))
-
-
-def _distance(elevation: Floats, beams: Floats) -> Floats:
-    """(N,) radians from each elevation to the nearest beam."""
-    up = np.sort(beams)
-    nearest = np.searchsorted((up[1:] + up[:-1]) / 2, elevation)
-    return np.asarray(np.abs(elevation - up[nearest]))
-
-
-def _count(elevation: Floats, places: Floats) -> NDArray[np.intp]:
-    """Number of elevations (sorted) within ``WINDOW`` of each place."""
-    above = np.searchsorted(elevation, places + WINDOW)
-    return np.asarray(above - np.searchsorted(elevation, places - WINDOW), np.intp)
-
-
-def _stands_alone(elevation: Floats, place: float, beams: Floats, points: int) -> bool:
-    """Whether fewer than a third as many points lie somewhere between a place and the next beam on
-    either side."""
-    for side in (1, -1):
-        gaps = side * (beams - place)
-        gap = min(gaps[gaps > 0], default=4 * STRAY)
-        between = place + side * np.linspace(WINDOW, min(gap, 4 * STRAY) - WINDOW, 16)
-        if gap < 3 * WINDOW or _count(elevation, between).min() >= points / 3:
-            return False
-    return True

@@ -12,16 +12,11 @@ from lidar_synth.geometry.lines import Cloud, Model, nearest_beams, residuals
 from lidar_synth.geometry.scan import Scan, Source, spread
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.azimuths import Azimuths, fit_azimuths, turn_of
-from lidar_synth.lab.fitting.beams import (
-    NEAREST,
-    Beams,
-    add_lost_beams,
-    fit_beams,
-    follows_time,
-    room_of,
-)
+from lidar_synth.lab.fitting.beams import NEAREST, Beams, fit_beams, room_of
 from lidar_synth.lab.fitting.doubts import doubts, name_vendor
 from lidar_synth.lab.fitting.limits import range_limits, range_step, reflectance_levels
+from lidar_synth.lab.fitting.lost_beams import add_lost_beams
+from lidar_synth.lab.fitting.points import follows_time
 
 Floats = NDArray[np.float64]
 
