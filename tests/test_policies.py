@@ -1,6 +1,7 @@
 """Label policies as objects: the same by name, equal by value, and with their own scans."""
 
 import pickle
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from lidar_synth import (
     make_policy,
 )
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.labels import POLICIES
 from lidar_synth.noise import keyed_rng
 
@@ -85,6 +86,16 @@ def test_policies_with_their_own_scans_or_objects_need_no_mixture(
     assert same(pasted, by_file) and same(pasted, by_name)
     with pytest.raises(ConfigError, match="bank="):
         PasteObjects()(synthetic, keyed_rng(2))
+
+
+def test_objects_in_boxes_need_no_instances() -> None:
+    real = cast([car(8, 2)])
+    unnumbered = replace(real, instance=None)
+    for scan in (real, unnumbered):
+        mixed = PolarMix(0, real=[scan])(cast(), keyed_rng(2))
+        assert mixed.boxes is not None and mixed.boxes.names == ("Car",)
+    with pytest.raises(DataError, match="no instances"):
+        PolarMix(real=[replace(unnumbered, boxes=None)])(cast(), keyed_rng(2))
 
 
 def test_an_unlabelled_pool_makes_batches_by_name_and_as_an_object() -> None:

@@ -247,9 +247,11 @@ class PolarMix(_RealMix):
         return replace(mixed, boxes=None)
 
     def _add_objects(self, mixed: Scan, other: Scan, rng: np.random.Generator) -> Scan:
-        objects = instances_of(other)
-        if other.boxes is not None:
-            objects = list(objects_of(other).values())
+        objects = (
+            instances_of(other)
+            if other.boxes is None
+            else list(objects_of(other).values())
+        )
         angles = rng.uniform(-np.pi, np.pi, len(objects))
         order = rng.permutation(len(objects))
         turned = (objects[i].turned(a) for i, a in zip(order, angles, strict=True))
