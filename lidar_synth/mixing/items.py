@@ -1,6 +1,6 @@
 """The plain PyTorch item, the default form of a sample."""
 
-from dataclasses import replace
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -29,16 +29,8 @@ class Item(dict[str, Any]):
 
 
 def copy_scan(scan: Scan) -> Scan:
-    """A scan with points, fields and boxes of its own, which may be changed in place."""
-    own: dict[str, Any] = {
-        name: values.copy() for name, values in scan.fields().items()
-    }
-    boxes = (
-        None
-        if scan.boxes is None
-        else replace(scan.boxes, values=scan.boxes.values.copy())
-    )
-    return replace(scan, points=scan.points.copy(), boxes=boxes, **own)
+    """A scan of which everything but the sensor may be changed in place."""
+    return deepcopy(scan, {id(scan.sensor): scan.sensor})
 
 
 def to_item(scan: Scan, rng: np.random.Generator) -> Item:

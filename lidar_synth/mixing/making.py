@@ -96,7 +96,9 @@ class SampleMaker:
 
     def synthetic(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
         """The sample of a scan of a synthetic source, given by its number."""
-        scan = copy_scan(scan) if self._transfer is None else self._transfer(scan, rng)
+        scan = copy_scan(scan)
+        if self._transfer is not None:
+            scan = self._transfer(scan, rng)
         given = scan
         if scan.boxes is not None:  # before labels of low confidence are ignored
             scan = self._without_unboxed(scan)
