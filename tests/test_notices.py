@@ -161,7 +161,7 @@ def test_names_that_differ_by_capitals_are(caplog: pytest.LogCaptureFixture) -> 
     assert "'Car'" in message and "'car'" in message and "by capitals" in message
 
 
-def test_real_scans_that_are_not_finite_are_refused_or_reported(
+def test_scans_that_are_not_finite_are_refused_or_reported(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     real = Scans("r", 4)
@@ -172,6 +172,8 @@ def test_real_scans_that_are_not_finite_are_refused_or_reported(
     real[0] = replace(real[0], points=real[0].points * np.float32(np.nan))
     with pytest.raises(DataError, match="'r0' with points that are NaN"):
         logged(MixedScans(real, Endless(), 0.5), caplog)
+    with pytest.raises(DataError, match="'r0' with points that are NaN"):
+        logged(MixedScans(Scans("r", 4), real, 0.5), caplog)
 
 
 def test_points_outside_of_the_view_that_has_boxes_are(

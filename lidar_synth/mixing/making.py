@@ -96,6 +96,7 @@ class SampleMaker:
 
     def synthetic(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
         """The sample of a scan of a synthetic source, given by its number."""
+        require_finite(scan)
         scan = copy_scan(scan)
         if self._transfer is not None:
             scan = self._transfer(scan, rng)
