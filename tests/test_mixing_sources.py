@@ -102,6 +102,7 @@ def test_sources_that_differ_have_different_plans() -> None:
         for indices in ([0, 1], [0, 2])
     ]
     assert len({identity_of(part) for part in parts}) == 4
+    assert len({identity_of(SeenAs(part, transfers[0])) for part in parts}) == 4
     assert identity_of(Subset(parts[0], [1])) != identity_of(Subset(parts[1], [1]))
     joined = [ConcatDataset([part, parts[0]]) for part in parts]
     assert len({identity_of(one) for one in joined}) == 4

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.geometry.projection.kernels import grid_of
-from lidar_synth.geometry.scan import Boxes, Scan, Source
+from lidar_synth.geometry.scan import Boxes, Scan, Source, identity_of
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.mount import Mount
@@ -284,7 +284,7 @@ class SeenAs:
         """A text that tells it from other sources: the source, or the names of its scans, transfer
         and seed."""
         own = getattr(self.source, "identity", "") or type(self.source).__name__
-        names = map(str, getattr(self.source, "ids", ()))
+        names = map(str, getattr(self.source, "ids", [identity_of(self.source)]))
         digest = hash_of_names([own, *names, self.transfer.identity, str(self.seed)])
         return f"{type(self).__name__}:{len(self)}:{digest[:16]}"
 
