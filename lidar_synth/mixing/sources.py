@@ -5,6 +5,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from torch.utils.data import ConcatDataset
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError, DataError
@@ -65,13 +66,7 @@ class Sources:
 
     def __getitem__(self, index: int) -> Any:
         """The scan at ``index`` of the concatenated sources."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"scan {index} of {len(self)}")
-        for source in self.sources:
-            if index < len(source):
-                return source[index]
-            index -= len(source)
-        raise AssertionError
+        return ConcatDataset(self.sources)[index]
 
 
 def each(source: Any) -> tuple[tuple[Any, float | None], ...]:
