@@ -257,10 +257,9 @@ def _have_returns(boxes: Boxes, scan: Scan) -> NDArray[np.bool_]:
 
 def _check_choice(key: str, values: Sequence[Any]) -> Sequence[Any]:
     """The values, which are names or [low, high]."""
-    if values and all(isinstance(v, str) for v in values):
-        return values
-    numbers = [v for v in values if type(v) in (int, float)]
-    if len(values) != 2 or len(numbers) != 2 or not values[0] <= values[1]:
+    kinds = set(map(type, values))
+    numbers = kinds <= {int, float} and len(values) == 2 and values[0] <= values[1]
+    if not numbers and kinds != {str}:
         raise ConfigError(
             f"{key}: {values!r}", "a number, [low, high], or a list of names"
         )
