@@ -12,7 +12,14 @@ from typing import Any
 
 import pytest
 from mixtures import Endless, Scans
-from torch.utils.data import DataLoader, DistributedSampler, RandomSampler, random_split
+from torch.utils.data import (
+    ConcatDataset,
+    DataLoader,
+    DistributedSampler,
+    RandomSampler,
+    Subset,
+    random_split,
+)
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.mixing import MixedScans, MixedStream
@@ -152,11 +159,16 @@ def test_batches_keep_the_epoch_in_which_iterating_began(
 def test_a_part_of_a_mixture_is_refused_and_a_part_of_its_real_scans_stays_apart(
     workers: int,
 ) -> None:
-    part, _ = random_split(mixed(), [0.8, 0.2])
-    refused(
-        iter(DataLoader(part, 4, collate_fn=list, num_workers=workers)),
-        r"random_split\(real, \[0.9, 0.1\]\)",
-    )
+    train = mixed()
+    part, other = random_split(train, [0.8, 0.2])
+    for dataset in (part, ConcatDataset([train, other])):
+        refused(
+            iter(DataLoader(dataset, 4, collate_fn=list, num_workers=workers)),
+            r"random_split\(real, \[0.9, 0.1\]\)",
+        )
+    others: Any = Subset(["x", "y"], [1])  # type: ignore[arg-type]
+    joined = DataLoader(ConcatDataset([train, others]), 4, collate_fn=list)
+    assert samples(joined) == [*planned(train, 0), "y"]
     kept, held = random_split(Scans("r", 20), [0.8, 0.2])  # type: ignore[arg-type]
     train = MixedScans(kept, Endless(), to_sample=name, collate=list)
     loader = DataLoader(

@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary, WeakSet
 
 import torch
 from torch import Tensor
-from torch.utils.data import Subset, get_worker_info
+from torch.utils.data import ConcatDataset, Subset, get_worker_info
 from torch.utils.data._utils.fetch import _MapDatasetFetcher
 
 from lidar_synth.errors import ConfigError
@@ -220,8 +220,13 @@ def check_whole(dataset: Any) -> None:
     """Refuse a ``Subset`` of a mixture.
 
     Raises:
-        ConfigError: if a DataLoader's dataset is one.
+        ConfigError: if a DataLoader's dataset is one, or a ``ConcatDataset`` with one in it.
     """
+    if isinstance(dataset, ConcatDataset):
+        for part in dataset.datasets:
+            # The others may be of any data.
+            if hasattr(getattr(part, "dataset", None), "current"):
+                check_whole(part)
     if isinstance(dataset, Subset):
         raise ConfigError(
             "a Subset of a mixture, of random_split for instance: its indices mean other scans in "

@@ -59,9 +59,11 @@ class MixedScans(Dataset[Any]):
 
     The order of an epoch is a pure function of the arguments and the epoch (plan.py) and is already
     shuffled: iterate in order (a ``DataLoader`` without ``shuffle``), or use ``batches``, which
-    also serves several ranks. Any other sampler works too. Call ``set_epoch`` before each epoch;
-    otherwise the same scans are repeated, with a warning. ``set_epoch`` after ``iter(loader)``
-    raises an error; with ``batches`` it takes effect with the next pass.
+    also serves several ranks. Samplers that treat all positions alike work too (``RandomSampler``,
+    ``DistributedSampler``); to hold scans out or weight them, split or weight the sources, as a
+    position is another scan in every epoch. Call ``set_epoch`` before each epoch; otherwise the
+    same scans are repeated, with a warning. ``set_epoch`` after ``iter(loader)`` raises an error;
+    with ``batches`` it takes effect with the next pass.
 
     Args:
         real: indexable source of ``Scan``, or ``Sources`` of several; None with ratio 1.
