@@ -180,6 +180,25 @@ def test_a_part_of_a_mixture_is_refused_and_a_part_of_its_real_scans_stays_apart
         assert seen == {scan.id for scan in Scans("r", 20)} - {scan.id for scan in held}
 
 
+@pytest.mark.parametrize("persistent", [False, True])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_mixture_as_the_real_source_follows_the_epoch(
+    workers: int, persistent: bool
+) -> None:
+    inner = mixed(4, 0.5)
+    train = MixedScans.wrap(inner, Endless(name="t"), 0.5, to_sample=name)
+    keep = persistent and workers > 0
+    options: dict[str, Any] = {"collate_fn": list, "persistent_workers": keep}
+    for loader in (
+        train.loader(4, workers, **options),
+        DataLoader(train, 4, num_workers=workers, **options),
+    ):
+        for epoch in (0, 1, 2):
+            loader.dataset.set_epoch(epoch)
+            seen = [sample for sample in samples(loader) if sample[0] != "t"]
+            assert sorted(seen) == sorted(planned(inner, epoch))
+
+
 @pytest.mark.parametrize("endless", [False, True])
 @pytest.mark.parametrize("workers", [0, 1, 2])
 def test_a_stream_keeps_the_epoch_in_which_iterating_began(

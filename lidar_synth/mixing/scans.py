@@ -355,9 +355,9 @@ class MixedScans(Dataset[Any]):
             self.expect(epoch)
 
     def tell_sources(self, epoch: int) -> None:
-        """Set the epoch of the synthetic sources that have one, such as a ``RollingBank`` with
-        ``refresh``."""
-        for source in self.synthetic:
+        """Set the epoch of the sources that have one, such as a ``RollingBank`` with ``refresh``
+        or a trainer's own dataset."""
+        for source in (*self.real, *self.synthetic):
             if hasattr(source, "set_epoch"):
                 source.set_epoch(epoch)
 
