@@ -91,6 +91,22 @@ def test_the_batch_size_limits_the_scans_solved_at_once(generator: Generator) ->
     assert generator.range_images(0, []) == []
 
 
+def test_the_callers_precision_and_mode_do_not_change_scans(
+    generator: Generator,
+) -> None:
+    [image] = generator.range_images(0, [3])
+    hole = image.range > 10
+    [drawn] = inpaint(generator, [image], [hole], 1, [0])
+    with torch.autocast("cpu", torch.bfloat16):
+        for _ in generator.samples(0, [3]):
+            assert torch.is_autocast_enabled("cpu")
+            assert not torch.is_inference_mode_enabled()
+        [same] = generator.range_images(0, [3])
+        [redrawn] = inpaint(generator, [image], [hole], 1, [0])
+    assert np.array_equal(image.range, same.range)
+    assert np.array_equal(drawn.range, redrawn.range)
+
+
 def test_scans_are_the_returns_of_the_images(generator: Generator) -> None:
     [image], [scan] = generator.range_images(2, [11]), generator.scans(2, [11])
     assert (scan.id, scan.domain, scan.sensor) == ("small/2/11", SYNTHETIC, SENSOR)

@@ -331,15 +331,18 @@ class Generator:
         for first in range(0, len(indices), self.batch):
             part = slice(first, first + self.batch)
             noise, draws = self.draw_noise(seed, indices[part], self.sensor)
-            with torch.inference_mode():
+            # The caller's autocast would give other scans.
+            exact = torch.autocast(self.device.type, enabled=False)
+            with torch.inference_mode(), exact:
                 own = None if given is None else given[part]
                 velocity, cond = self._flow(own, guidance, grid)
                 state = solve(velocity, noise, grid, solver, cond)
-                yield codec.decode(
+                made = codec.decode(
                     state,
                     draws,
                     None if own is None else {str(self.condition): own},
                 )
+            yield made
 
     def draw_noise(
         self, seed: int, indices: Sequence[int], sensor: Sensor

@@ -115,12 +115,12 @@ def _batch(
     codec = generator.codec
     device = generator.device
     images = [_complete(image) for image in images]
-    known = codec.encode(generator.tensors.from_images(images).to(device))
     mask = torch.from_numpy(np.stack(holes)).to(device, torch.float32)[:, None]
     inside = adaptive_max_pool2d(mask, codec.shape[1:]) > 0
     sensor = generator.header.sensor
     noise, draws = generator.draw_noise(seed, indices, sensor)
-    with torch.inference_mode():
+    with torch.inference_mode(), torch.autocast(device.type, enabled=False):
+        known = codec.encode(generator.tensors.from_images(images).to(device))
         state = codec.decode(_sample(generator, known, noise, inside, start), draws)
     results = []
     for image, hole, new in zip(
