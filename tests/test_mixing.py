@@ -1,6 +1,7 @@
 """``MixedScans``: the same samples whatever the workers and ranks, real ones bit for bit, and clear
 refusals."""
 
+import json
 import os
 import pickle
 import warnings
@@ -18,7 +19,8 @@ from torch.utils.data import DataLoader
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
+from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan, model_provenance
+from lidar_synth.lab.town import Town
 from lidar_synth.mixing import MixedScans, MixedStream, Sources
 from lidar_synth.mixing.state import make_state
 from lidar_synth.noise import keyed_rng
@@ -274,15 +276,18 @@ def test_wrap_returns_samples_of_the_wrapped_dataset_unchanged() -> None:
     ]
 
 
-def test_seeds_and_weights_may_be_numpys() -> None:
-    sources = Endless(), Endless(name="t")
-    given, plain = (
-        MixedScans(
-            Scans("r", 6), Sources(*sources, weights=weights), ratio=0.5, seed=seed
-        )
-        for weights, seed in ((np.array([3, 1]), np.int64(1)), ([3, 1], 1))
-    )
-    assert ids(given) == ids(plain) and given.plan(0).hash == plain.plan(0).hash
+def test_numbers_may_be_numpys() -> None:
+    made = []
+    for number, weights in ((np.int64, np.array([3, 1])), (int, [3, 1])):
+        sources = Sources(Endless(), Endless(name="t"), weights=weights)
+        options = {"seed": number(1), "reuse": number(2)}
+        train = MixedScans(Scans("r", 6), sources, ratio=0.5, **options)
+        stream = MixedStream(train, batch_size=number(4))
+        states = [of.state_dict(1) for of in (stream, train.batches(number(4)))]
+        made.append((ids(train), train.plan(0).hash, json.dumps(states)))
+    assert made[0] == made[1]
+    assert Town(np.int64(1), scans=2).identity == Town(1, scans=2).identity
+    json.dumps(model_provenance("town", "", np.int64(3)))
 
 
 def test_several_sources() -> None:

@@ -328,7 +328,8 @@ def model_provenance(name: str, checkpoint: str, seed: int) -> dict[str, Any]:
         checkpoint: its hash.
         seed: the seed of generation.
     """
-    return {"made_by": "model", "model": name, "checkpoint": checkpoint, "seed": seed}
+    named = {"model": name, "checkpoint": checkpoint}
+    return {"made_by": "model", **named, "seed": int(seed)}
 
 
 @dataclass

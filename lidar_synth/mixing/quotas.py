@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.mixing.schedules import Schedule, settled, share_of, to_integer
+from lidar_synth.mixing.schedules import Schedule, settled, share_of
 
 EpochSize = Literal["add", "replace"] | int
 """The length of all epochs: ``"add"`` uses every real scan once and adds synthetic ones to reach
@@ -93,7 +93,7 @@ class Mixture:
             raise ConfigError(
                 f"epoch_size={size!r}", "'add', 'replace' or a number of samples"
             )
-        if to_integer(self.reuse, "reuse") < 1:
+        if self.reuse < 1:
             raise ConfigError(
                 f"reuse={self.reuse}",
                 "the number of epochs that use a synthetic scan, at least 1",

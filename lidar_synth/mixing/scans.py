@@ -193,7 +193,7 @@ class MixedScans(Dataset[Any]):
             make_schedule(ratio),
             seed,
             epoch_size,
-            reuse,
+            to_integer(reuse, "reuse"),
             balanced or locality is not None,
         )
         kept = () if real_as_is else self.real

@@ -74,7 +74,7 @@ class MixedStream(Divided, IterableDataset[Any]):
     ) -> None:
         check_count("batch_size", batch_size, 1)
         self.scans = scans
-        self.batch_size = batch_size
+        self.batch_size = int(batch_size)
         self.endless = endless
         self.drop_last = drop_last
         self.collate = scans.collate

@@ -99,7 +99,7 @@ class Town:
                 f"a town with seed {seed}, {scans} scans and an interval of {interval} s",
                 "seed >= 0, scans >= 0 and 0 < interval < 60 s",
             )
-        self.seed = seed
+        self.seed = int(seed)
         self.sensor = load_sensor(sensor)
         self.interval = interval
         self.skin = None if skin is None else load_skin(skin)
