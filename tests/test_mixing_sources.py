@@ -14,6 +14,7 @@ from test_generator import SENSOR as GENERATED_SENSOR
 from test_generator import write
 from torch.utils.data import ConcatDataset, DataLoader, IterableDataset, Subset
 
+from lidar_synth import PolarMix, mix
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import KITTI360, SemanticKITTI
@@ -36,7 +37,7 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Generator:
 def test_exchanged_arguments_are_named(generator: Generator) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"real=Generator, which has no length; expected real scans first",
+        match=r"Generator as a source of scans.*real scans come first",
     ):
         MixedScans(generator, Scans("r", 4, GENERATED_SENSOR), 0.5)
 
@@ -142,6 +143,8 @@ def test_a_conditional_model_takes_its_conditions_in_turn(
     with pytest.raises(ConfigError, match="conditions for 'tiny'; expected none"):
         Generated(generator, condition=["a map"])
     monkeypatch.setattr(Generator, "condition", "semantic")
+    with pytest.raises(ConfigError, match="no conditions for 'tiny'"):
+        Generated(generator, condition=[])
     with pytest.raises(
         ConfigError,
         match=r"no conditions for 'tiny'; expected .*\(semantic\).*condition=real",
@@ -358,12 +361,27 @@ def batch_of(sample: Any) -> Any:
         (
             lambda: MixedScans.wrap(OneByOne(), Endless(), to_sample=as_is),
             ConfigError,
-            r"real=OneByOne.*map-style dataset",
+            r"OneByOne as a source.*map-style dataset",
+        ),
+        (lambda: mix(OneByOne(), Endless()), ConfigError, "OneByOne as a source"),
+        (
+            lambda: mix((s for s in Scans("r", 4)), Endless()),
+            ConfigError,
+            "generator as a source",
         ),
         (
-            lambda: MixedScans(iter(Scans("r", 4)), Endless()),
+            lambda: mix(Scans("r", 4), {"path": "bank"}),
             ConfigError,
-            r"real=list_iterator.*map-style dataset",
+            "dict as a source",
+        ),
+        (
+            lambda: MixedScans(
+                Scans("r", 4),
+                Endless(),
+                labels=PolarMix(real="folder"),  # type: ignore[arg-type]
+            ),
+            ConfigError,
+            r"str as a source.*open_scans\(path\)",
         ),
         (
             lambda: batch_of({"points": 1}),

@@ -12,7 +12,7 @@ from hypothesis import given
 from pasting import assert_nothing_shares_a_ray
 
 from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI, TRAIN_ID
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import KITTIObject, SemanticKITTI
 from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.overlap import count_overlapping, find_overlapping
@@ -161,6 +161,9 @@ def test_a_bank_needs_boxes_and_one_sensor() -> None:
     mixed = [cast([car(8, 3)]), cast([car(8, 3)], sensor=presets()["os1_128"])]
     with pytest.raises(DataError, match=r"sensors \['os1_128', 'town'\]"):
         ObjectBank.from_scans(mixed)
+    for wrong in ("folder", mixed[0]):
+        with pytest.raises(ConfigError, match="as a source of scans"):
+            ObjectBank.from_scans(wrong)  # type: ignore[arg-type]
 
 
 def test_without_instances_an_object_is_what_stands_in_its_box() -> None:

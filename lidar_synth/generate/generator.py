@@ -455,9 +455,10 @@ class Generated:
             raise ConfigError(f"cache={cache}", "a number of scans")
         for name in sampling:
             choose("sampling option", name, _OPTIONS)
-        if (condition is None) != (generator.condition is None):
+        given = condition is not None and len(condition) > 0
+        if given == (generator.condition is None):
             raise ConfigError(
-                f"{'no conditions' if condition is None else 'conditions'} for {generator.name!r}",
+                f"{'conditions' if given else 'no conditions'} for {generator.name!r}",
                 f"a source of conditions ({generator.condition})"
                 if generator.condition
                 else "none",

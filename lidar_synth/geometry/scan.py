@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.geometry.sensor import Sensor
 
@@ -400,6 +400,20 @@ class Source(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int, /) -> Scan: ...
+
+
+def check_source(source: Any) -> None:
+    """Refuse what gives no scans by number.
+
+    Raises:
+        ConfigError: on a path, a dict, a single scan, or what has no length.
+    """
+    if isinstance(source, str | Mapping | Scan) or not isinstance(source, Source):
+        raise ConfigError(
+            f"{type(source).__name__} as a source of scans",
+            "a map-style dataset, with __len__ and __getitem__",
+            "open_scans(path) opens a folder; real scans come first, then synthetic ones.",
+        )
 
 
 def spread(indices: Sequence[int], count: int) -> list[int]:

@@ -32,7 +32,7 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
-from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan, Source
+from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan, Source, check_source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import join_boxes
 from lidar_synth.labels.objects import Object, objects_of
@@ -154,10 +154,14 @@ class ObjectBank:
             least: minimum number of points of an object.
 
         Raises:
+            ConfigError: on a path or a single scan.
             DataError: if there is no object in any of the scans, or the scans have several sensors.
         """
         objects: list[tuple[int, Object]] = []
-        chosen = range(len(source)) if scans is None else list(scans)
+        if scans is None:
+            check_source(source)
+            scans = range(len(source))
+        chosen = list(scans)
         for index in tqdm(
             chosen, "collecting objects", unit="scan", leave=False, disable=None
         ):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import BOXED
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry.scan import Scan, Source, check_source
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.edit.redraw import open_model
 from lidar_synth.labels.edit.unboxed import remove_unboxed
@@ -336,7 +336,8 @@ def _draw_real(
 
 def _first_labelled(real: Source | None, policy: str) -> Scan:
     """The first of the real scans, which has labels."""
-    if real is None or not len(real):
+    check_source(real or ())
+    if not real:
         raise _no_labels("no real scans", policy)
     first = real[0]
     if first.label is None:

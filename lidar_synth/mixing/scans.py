@@ -1,22 +1,17 @@
 """``MixedScans``: real and synthetic scans in one map-style dataset."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakValueDictionary
 
 import numpy as np
-from torch.utils.data import (
-    Dataset,
-    IterableDataset,
-    default_collate,
-    get_worker_info,
-)
+from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, identity_of
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, check_source, identity_of
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
@@ -171,7 +166,8 @@ class MixedScans(Dataset[Any]):
             epoch_size = to_integer(epoch_size, "epoch_size")
         if locality not in (None, "shard"):
             raise ConfigError(f"locality={locality!r}", '"shard", or None')
-        _check_lengths(reals)
+        for source, _ in reals:
+            check_source(source)
         synthetics = [
             (make_synthetic(source, seed), weight) for source, weight in each(synth)
         ]
@@ -548,27 +544,6 @@ class MixedScans(Dataset[Any]):
             (2, 0)
         """
         return MixedLoader(self, batch_size, num_workers, **options)
-
-
-def _check_lengths(reals: Iterable[tuple[Any, float | None]]) -> None:
-    """Refuse real sources without a length, or by iteration only.
-
-    Raises:
-        ConfigError: on one.
-    """
-    for source, _ in reals:
-        if isinstance(source, IterableDataset | Iterator):
-            raise ConfigError(
-                f"real={type(source).__name__}, which only gives samples in turn",
-                "a map-style dataset, with __len__ and __getitem__",
-                "The order of a mixture takes samples by their numbers.",
-            )
-        if not hasattr(source, "__len__"):
-            raise ConfigError(
-                f"real={type(source).__name__}, which has no length",
-                "real scans first, then what synthetic ones come from",
-                "MixedScans(real, synth, ratio)",
-            )
 
 
 def _plan_synthetic(

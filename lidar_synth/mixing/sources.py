@@ -9,7 +9,7 @@ from torch.utils.data import ConcatDataset
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import Scan, check_source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.own import check_share
 
@@ -88,12 +88,13 @@ def sensor_of(source: Any) -> Sensor:
     or the sensor that is given.
 
     Raises:
-        ConfigError: if its samples are not scans.
+        ConfigError: if it has no samples by number, or they are not scans.
         DataError: if it is empty.
     """
     sensor = getattr(source, "sensor", source)
     if isinstance(sensor, Sensor):
         return sensor
+    check_source(source)
     if not len(source):
         raise DataError("a source without scans", "at least one scan")
     first = source[0]
