@@ -329,7 +329,7 @@ def batch_of(sample: Any) -> Any:
         (
             lambda: MixedScans(Scans("r", 2), "town"),
             ConfigError,
-            r"str as a source of synthetic scans.*load_generator",
+            r"str as a source of scans.*load_generator",
         ),
         (
             lambda: MixedScans(Scans("r", 2), labels="ignore"),
@@ -363,6 +363,7 @@ def batch_of(sample: Any) -> Any:
             ConfigError,
             r"OneByOne as a source.*map-style dataset",
         ),
+        (lambda: MixedScans(Scans("r", 4), []), DataError, "a source without scans"),
         (lambda: mix(OneByOne(), Endless()), ConfigError, "OneByOne as a source"),
         (
             lambda: mix((s for s in Scans("r", 4)), Endless()),

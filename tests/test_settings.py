@@ -74,7 +74,7 @@ def test_a_yaml_bomb_is_refused_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("synthetic", [{"threshold": 1}, "a" * 5000])
 def test_what_is_no_source_is_refused(synthetic: object) -> None:
-    with pytest.raises(ConfigError, match="as a source of synthetic scans|model 'aaa"):
+    with pytest.raises(ConfigError, match="as a source of scans|model 'aaa"):
         mix_for_trainer(4, {"synthetic": synthetic}, as_is)
 
 

@@ -328,8 +328,12 @@ def model_provenance(name: str, checkpoint: str, seed: int) -> dict[str, Any]:
         checkpoint: its hash.
         seed: the seed of generation.
     """
-    named = {"model": name, "checkpoint": checkpoint}
-    return {"made_by": "model", **named, "seed": int(seed)}
+    return {
+        "made_by": "model",
+        "model": name,
+        "checkpoint": checkpoint,
+        "seed": int(seed),
+    }
 
 
 @dataclass
@@ -412,7 +416,8 @@ def check_source(source: Any) -> None:
         raise ConfigError(
             f"{type(source).__name__} as a source of scans",
             "a map-style dataset, with __len__ and __getitem__",
-            "open_scans(path) opens a folder; real scans come first, then synthetic ones.",
+            "open_scans(path) opens a folder, load_generator('town') a model; real scans come "
+            "first, then synthetic ones.",
         )
 
 

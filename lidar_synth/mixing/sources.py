@@ -83,17 +83,13 @@ def loss_weights_of(source: Any) -> tuple[float, ...]:
     return getattr(source, "loss_weights", (1.0,) * len(each(source)))
 
 
-def sensor_of(source: Any) -> Sensor:
-    """The sensor of a source of scans: its attribute ``sensor``, or the sensor of its first scan;
-    or the sensor that is given.
+def first_of(source: Any) -> Scan:
+    """The first scan of a source.
 
     Raises:
         ConfigError: if it has no samples by number, or they are not scans.
         DataError: if it is empty.
     """
-    sensor = getattr(source, "sensor", source)
-    if isinstance(sensor, Sensor):
-        return sensor
     check_source(source)
     if not len(source):
         raise DataError("a source without scans", "at least one scan")
@@ -104,7 +100,14 @@ def sensor_of(source: Any) -> Sensor:
             "scans",
             "MixedScans.wrap(dataset, synth, to_sample=...) takes a trainer's own dataset.",
         )
-    return first.sensor
+    return first
+
+
+def sensor_of(source: Any) -> Sensor:
+    """The sensor of a source of scans: its attribute ``sensor``, or the sensor of its first scan,
+    see ``first_of``; or the sensor that is given."""
+    sensor = getattr(source, "sensor", source)
+    return sensor if isinstance(sensor, Sensor) else first_of(source).sensor
 
 
 def agree(rule: Callable[[Sensor, Sensor], bool], reals: Any, synthetics: Any) -> bool:

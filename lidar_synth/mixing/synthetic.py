@@ -1,12 +1,11 @@
 """Sources of synthetic scans: one interface for generators, banks and scans that exist already."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Protocol, cast, runtime_checkable
 
-from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import SYNTHETIC, Scan, Source, identity_of
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.mixing.sources import first_of
 
 
 @runtime_checkable
@@ -50,7 +49,7 @@ class Held:
     """
 
     def __init__(self, source: Source) -> None:
-        first = source[0]
+        first = first_of(source)
         self.sensor: Sensor = getattr(source, "sensor", first.sensor)
         self.fields = frozenset(first.fields()) | (
             frozenset() if first.boxes is None else {"boxes"}
@@ -72,17 +71,11 @@ def make_synthetic(source: Any, seed: int = 0) -> Synthetic:
         seed: seed of the scans that a generator makes.
 
     Raises:
-        ConfigError: on any other type.
+        ConfigError: on any other type, or samples that are not scans.
+        DataError: on existing scans of which there are none.
     """
     if hasattr(source, "as_synthetic"):
         return cast(Synthetic, source.as_synthetic(seed))
     if isinstance(source, Synthetic) and not getattr(source, "recorded", False):
         return source
-    by_index = isinstance(source, Source) and not isinstance(source, Mapping)
-    if by_index and len(source) and isinstance(source[0], Scan):
-        return Held(source)
-    raise ConfigError(
-        f"{type(source).__name__} as a source of synthetic scans",
-        "a generator, a bank, a rolling bank, or scans by index",
-        "load_generator('town') makes a generator of the shipped model.",
-    )
+    return Held(source)
