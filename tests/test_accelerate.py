@@ -126,7 +126,7 @@ def check_refusals(accelerator: Any) -> None:
                 ):
                     loader.set_epoch(loader.iteration)
         with pytest.raises(
-            ConfigError, match=r"of 2 and an Accelerator.*accelerate.prepare"
+            ConfigError, match=r"of 2 and an Accelerator.*accelerate import prepare"
         ):
             iter(make(mixed(), 0))
     with pytest.raises(ConfigError, match="batches come from BatchSampler"):

@@ -81,8 +81,8 @@ class Divided:
                 "Accelerator, which divides prepared loaders among the same processes again: most "
                 "samples would never be seen",
                 "only one of the two to divide the samples",
-                "Prepare the loader by lidar_synth.integrations.accelerate.prepare(accelerator, "
-                f"loader); if it is not prepared, call {self.call} with "
+                "from lidar_synth.integrations.accelerate import prepare; loader = "
+                f"prepare(accelerator, loader). If it is not prepared, call {self.call} with "
                 "rank=accelerator.process_index, world_size=accelerator.num_processes.",
             )
 
