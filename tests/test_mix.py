@@ -186,10 +186,17 @@ def test_an_epoch_without_a_whole_batch_is_refused() -> None:
     assert len(list(train.loader(batch_size=len(train), drop_last=True))) == 1
 
 
+@pytest.mark.parametrize("name", ["epoch", "real_as_is"])
+def test_an_argument_that_mix_does_not_have_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"argument of mix {name!r}.*'epochs'"):
+        lidar_synth.mix(Scans("r", 4), Endless(), **{name: 1})
+
+
 def test_batches_in_another_order_are_refused() -> None:
     """A state counts batches: it would resume after others than those that came."""
-    with pytest.raises(ConfigError, match="in_order=False; expected batches in"):
-        mixture().loader(batch_size=4, num_workers=2, in_order=False)
+    for order in ({"in_order": False}, {"shuffle": True}, {"sampler": [1, 0]}):
+        with pytest.raises(ConfigError, match=f"{[*order][0]}.*expected batches in"):
+            mixture().loader(batch_size=4, **order)
 
 
 def test_the_names_of_the_package_are_shown() -> None:

@@ -28,7 +28,8 @@ class MixedLoader(DataLoader[Any]):
         options: further arguments of ``DataLoader``.
 
     Raises:
-        ConfigError: on a batch size below 1, or ``in_order=False``.
+        ConfigError: on a batch size below 1, or another order of samples (``shuffle``, a sampler,
+            ``in_order=False``).
     """
 
     def __init__(
@@ -40,10 +41,11 @@ class MixedLoader(DataLoader[Any]):
         drop_last: bool = False,
         **options: Any,
     ) -> None:
-        if not options.get("in_order", True):
+        orders = [n for n in ("shuffle", "sampler") if options.get(n)]
+        if orders or not options.get("in_order", True):
             raise ConfigError(
-                "in_order=False",
-                "batches in the plan's order, as state_dict counts them",
+                f"{[*orders, 'in_order=False'][0]} for a loader of a mixture",
+                "batches in the plan's order, which is shuffled, as state_dict counts them",
             )
         self._mixed = dataset
         self._batches: MixedBatches = dataset.batches(batch_size, drop_last=drop_last)

@@ -170,7 +170,8 @@ def mix(
                 )
     given = {"ratio": ratio, "labels": labels, "as_sensor": as_sensor}
     own |= {name: value for name, value in given.items() if value is not None}
-    known = inspect.signature(MixedScans).parameters
+    known = dict(inspect.signature(MixedScans).parameters, epochs=0, task=0)
+    del known["real_as_is"]
     for name in options:
         choose("argument of mix", name, known)
     return MixedScans(reals, synthetics, **(own | options))
