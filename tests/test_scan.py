@@ -1,6 +1,7 @@
 """Scans, boxes, class tables and error messages."""
 
 import copy
+from dataclasses import replace
 
 import hypothesis.strategies as st
 import numpy as np
@@ -58,6 +59,13 @@ def test_corners_follow_the_yaw_and_points_near_the_floor_can_be_excluded() -> N
     points = np.array([[0, 1.9, 0], [1.9, 0, 0], [0, 0, -0.9]], np.float32)
     assert box.contain(points).tolist() == [[True, False, True]]
     assert box.contain(points, above_floor=0.3).tolist() == [[True, False, False]]
+
+
+def test_points_become_float32() -> None:
+    scan = random_scan(presets()["vlp16"], 20)
+    wide = replace(scan, points=scan.points.astype(np.float64))
+    assert np.array_equal(wide.points, scan.points) and wide.points.dtype == np.float32
+    assert replace(scan).points is scan.points
 
 
 def test_selecting_keeps_fields_together() -> None:

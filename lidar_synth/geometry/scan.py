@@ -259,6 +259,7 @@ class Scan:
     augmented: tuple[Mapping[str, Mapping[str, Any]], ...] = ()
 
     def __post_init__(self) -> None:
+        self.points = np.asarray(self.points, np.float32)
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise DataError(
                 f"scan {self.id!r}: points of shape {self.points.shape}",
