@@ -386,6 +386,16 @@ def test_forms_of_batches() -> None:
         assert batch["box_offsets"].tolist() == [0, 0, 0, 0]
 
 
+def test_another_default_dtype_does_not_change_batches() -> None:
+    train = MixedScans(Scans("r", 2), Endless(), 0.5)
+    torch.set_default_dtype(torch.float64)
+    try:
+        batch = train.collate([train[0]])
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert batch["loss_weight"].dtype == batch["points"].dtype == torch.float32
+
+
 def test_fewer_samples_than_ranks_gives_a_warning() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -13,7 +13,7 @@ from torch.utils.data import default_collate
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError, suggest
+from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -63,13 +63,8 @@ class Collate:
 
     def __post_init__(self) -> None:
         for name, kind in (("form", Form), ("unlabelled", Unlabelled)):
-            given = getattr(self, name)
-            if given not in get_args(kind):
-                raise ConfigError(
-                    f"{name}={given!r} of batches",
-                    f"one of {get_args(kind)}",
-                    suggest(given, get_args(kind)),
-                )
+            known = dict.fromkeys(get_args(kind))
+            choose(f"{name} of batches", getattr(self, name), known)
         if self.form == "range" and self.sensor is None:
             raise ConfigError(
                 "range images without a sensor", "a sensor, which defines their grid"
@@ -98,14 +93,14 @@ class Collate:
             "names": [item["names"] for item in items],
             "domain": torch.tensor([item["domain"] for item in items]),
             "loss_weight": torch.tensor(
-                [item.get("loss_weight", 1.0) for item in items]
+                [item.get("loss_weight", 1.0) for item in items], dtype=torch.float32
             ),
             "id": [item["id"] for item in items],
         }
         if (
             self.unlabelled == "error"
             and not len(batch["boxes"])
-            and not bool((batch["label"] != IGNORE).any())
+            and not (batch["label"] != IGNORE).any()
         ):
             raise DataError(
                 f"a batch without any valid label or box (scans {batch['id'][:4]})",
