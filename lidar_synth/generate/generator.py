@@ -332,8 +332,10 @@ class Generator:
             part = slice(first, first + self.batch)
             noise, draws = self.draw_noise(seed, indices[part], self.sensor)
             # The caller's autocast would give other scans.
-            exact = torch.autocast(self.device.type, enabled=False)
-            with torch.inference_mode(), exact:
+            with (
+                torch.inference_mode(),
+                torch.autocast(self.device.type, enabled=False),
+            ):
                 own = None if given is None else given[part]
                 velocity, cond = self._flow(own, guidance, grid)
                 state = solve(velocity, noise, grid, solver, cond)
@@ -498,10 +500,9 @@ class Generated:
             self._cached.move_to_end(number)
             return self._cached[number]
         [scan] = self.scans([number])
-        if self._cache_size:
-            self._cached[number] = scan
-            if len(self._cached) > self._cache_size:
-                self._cached.popitem(last=False)
+        self._cached[number] = scan
+        if len(self._cached) > self._cache_size:
+            self._cached.popitem(last=False)
         return scan
 
     def scans(self, numbers: Sequence[int]) -> list[Scan]:
