@@ -286,7 +286,11 @@ def batch_of(sample: Any) -> Any:
             r"labels='gessed'; expected one of",
         ),
         (lambda: mixed(collate="voxels"), ConfigError, "form of batches 'voxels'"),
-        (lambda: mixed(unlabelled="skip"), ConfigError, r"unlabelled of batches 'skip'"),
+        (
+            lambda: mixed(unlabelled="skip"),
+            ConfigError,
+            r"unlabelled of batches 'skip'",
+        ),
         (lambda: mixed()[15], IndexError, r"sample 15 of 15"),
         (lambda: mixed().batches(0), ConfigError, r"batch_size 0"),
         (lambda: mixed().batches(2, rank=2, world_size=2), ConfigError, r"rank 2 of 2"),

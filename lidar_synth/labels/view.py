@@ -116,7 +116,7 @@ def refuse_coarser(given: Sensor, wanted: Sensor) -> None:
         raise DataError(
             f"returns of sensor {given.name!r} for a scan of {wanted.name!r}",
             "those of a sensor with at least as many beams and columns",
-            f"Open them with sensor={wanted.name!r} (of the same device) or as_sensor={wanted.name!r}.",
+            f"Open them with sensor={wanted.name!r}, if of the same device, else with as_sensor.",
         )
 
 
