@@ -7,6 +7,7 @@ In a trainer's configuration, a mixture is a dict of settings::
 """
 
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.labels.own import IgnoreLabels, RemoveLabels
 from lidar_synth.labels.policies import read_policy
+from lidar_synth.mixing import MixedScans, MixingPlan
+from lidar_synth.mixing.schedules import settled
 from lidar_synth.mixing.settings import (
     OPTIONS,
     VARIABLE,
@@ -75,6 +78,18 @@ def take_classes(settings: dict[str, Any]) -> Taxonomy:
         {0: IGNORE} | {i: TRAIN_ID[n] for n, i in given.items()},
         tuple(given.get(n, 0) for n in NAMES),
     )
+
+
+def synthetic_epoch(mixed: MixedScans, epoch: int = 0) -> int | None:
+    """The nearest epoch with synthetic samples: this one, or the latest before it, or the next one
+    after it; None if no epoch has any.
+
+    Of a schedule that never settles the first hundred epochs count.
+    """
+    last = settled(mixed.mixture.ratio)
+    later = range(epoch + 1, 1 + (100 if last is None else last))
+    tried = chain(range(epoch, -1, -1), later)
+    return next((e for e in tried if MixingPlan(mixed.mixture, e).synthetics), None)
 
 
 def trainer_ids(

@@ -10,7 +10,6 @@ import json
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import cache
-from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ from lidar_synth.integrations.mixture import (
     mix_for_trainer,
     points_of,
     require_labels,
+    synthetic_epoch,
 )
 from lidar_synth.integrations.mmdet3d_lists import CLASSES
 from lidar_synth.integrations.nuscenes import CLASSES as NUSCENES_CLASSES
@@ -87,7 +87,8 @@ class SlotFolder:
         self.real = int(facts["real"])
         self.layout = LAYOUTS[facts.get("layout", "kitti")]
         self.mixed = mix_for_trainer(self.real, self.settings, weighs=True)
-        self.slots = self.mixed.mixture.laps[0]
+        some = synthetic_epoch(self.mixed) is not None
+        self.slots = self.mixed.mixture.laps[0] if some else 0
         self._view = (
             None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
         )
@@ -176,12 +177,11 @@ class SlotFolder:
         return self._cached[key]
 
     def _position(self, epoch: int, slot: int) -> tuple[int, int]:
-        """Epoch and position of a slot: in this epoch, or the latest one before it, or the next one
-        after it, that has synthetic scans."""
-        if not 0 <= slot < self.slots:
-            raise DataError(f"slot {slot} of {self.path}", f"0 to {self.slots - 1}")
-        tried = chain(range(epoch, -1, -1), count(epoch + 1))
-        epoch = next(e for e in tried if self.mixed.plan(e).synthetics)
+        """Epoch and position of a slot: in the nearest epoch that has synthetic scans."""
+        found = synthetic_epoch(self.mixed, epoch)
+        if found is None or not 0 <= slot < self.slots:
+            raise DataError(f"slot {slot} of {self.path}", f"one of its {self.slots}")
+        epoch = found
         positions = np.flatnonzero(self.entries(epoch) >= self.real)
         return epoch, int(positions[slot % len(positions)])
 

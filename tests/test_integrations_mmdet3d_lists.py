@@ -323,6 +323,23 @@ def test_a_list_may_begin_with_real_scans_alone(scans: Path, tmp_path: Path) -> 
         assert early.scan(slot).id == late.scan(slot).id
 
 
+@pytest.mark.parametrize("ratio", [0, {0: 0.0, 5: 0.0}])
+def test_a_list_of_real_scans_alone_has_no_slots(
+    scans: Path, tmp_path: Path, ratio: Any
+) -> None:
+    """The baseline: also a detector's, whose synthetic scans are looked at for boxes."""
+    listed = nuscenes_like(tmp_path / "n")
+    settings = MIX | {"synthetic": scans, "ratio": ratio}
+    path = write_infos(
+        tmp_path / "m", listed, settings, data_root=tmp_path / "n", **WHERE
+    )
+    assert len(json.loads(path.read_text())["data_list"]) == REAL
+    folder = SlotFolder.open(tmp_path / "m")
+    assert folder.slots == 0 and folder.entries(7).max() < REAL
+    with pytest.raises(DataError, match="slot 0 of"):
+        folder.scan(0)
+
+
 @pytest.mark.parametrize(
     ("settings", "shares"),
     [
