@@ -15,13 +15,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry.scan import Source
-from lidar_synth.mixing import Collate, MixedBatches, MixedScans, to_item
+from lidar_synth.mixing import Collate, MixedBatches, MixedScans
 from lidar_synth.mixing.batches import CutSteps, cut_steps
+from lidar_synth.mixing.items import copy_scan
 from lidar_synth.mixing.service.batches import Places, complete
 from lidar_synth.mixing.state import after_epoch, check_state, make_state
 from lidar_synth.noise import keyed_rng
@@ -46,17 +47,18 @@ if lightning.__version__ in STOLEN:
     )
 
 
-class Items(Dataset[Any]):
-    """Scans as plain PyTorch items, for validation and test."""
+class RealSamples(Dataset[Any]):
+    """Scans in the form of a mixture's samples, without augmentation, for validation and test."""
 
-    def __init__(self, scans: Source) -> None:
+    def __init__(self, scans: Source, train: MixedScans) -> None:
         self.scans = scans
+        self._to_sample = train._maker._to_sample
 
     def __len__(self) -> int:
         return len(self.scans)
 
     def __getitem__(self, index: int) -> Any:
-        return to_item(self.scans[index], keyed_rng(0, index))
+        return self._to_sample(copy_scan(self.scans[index]), keyed_rng(0, index))
 
 
 class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
@@ -64,7 +66,9 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
 
     Args:
         train: the mixture.
-        val, test: scans; None = no such loader.
+        val, test: scans, which get the form of the mixture's samples; with ``MixedScans.wrap`` your
+            own datasets, whose samples stay as they are; None = no such loader. Several devices
+            share them; as usual, a few samples may be repeated so that all have as many.
         batch_size: number of samples in a batch, on each rank.
         num_workers: number of workers of each loader; they persist over the epochs.
         on_device: whether the main process makes synthetic scans after the batch transfer, with
@@ -187,11 +191,21 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
     def _plain(self, scans: Source | None) -> Any:
         if scans is None:
             return []
-        given = self.train.collate
-        collate = given if isinstance(given, Collate) else Collate()
-        collate = replace(collate, unlabelled="allow")
+        as_is = self.train._real_as_is
+        dataset: Any = scans if as_is else RealSamples(scans, self.train)
+        collate = self.train.collate
+        if isinstance(collate, Collate):
+            collate = replace(collate, unlabelled="allow")
+        share = self.trainer and self.trainer.distributed_sampler_kwargs
+        sampler: Any = (
+            DistributedSampler(dataset, **share, shuffle=False) if share else None
+        )
         return DataLoader(
-            Items(scans), self.batch_size, collate_fn=collate, **self._workers()
+            dataset,
+            self.batch_size,
+            sampler=sampler,
+            collate_fn=collate,
+            **self._workers(),
         )
 
 

@@ -85,6 +85,42 @@ def test_scans_of_validation_need_no_labels() -> None:
     assert model.validated == 4
 
 
+def as_pair(scan: Any, rng: Any) -> Any:
+    scan.points += 1  # its own copy
+    return torch.full((8, 8), scan.points.max()), torch.full((8, 8), len(scan))
+
+
+def in_pairs(items: Any) -> Any:
+    first, second = zip(*items, strict=True)
+    return {"first": torch.stack(first), "second": torch.stack(second)}
+
+
+class Wrapped:
+    """A trainer's own dataset of pairs."""
+
+    def __len__(self) -> int:
+        return 3
+
+    def __getitem__(self, index: int) -> Any:
+        return torch.full((8, 8), float(index)), torch.ones(8, 8, dtype=torch.int64)
+
+
+def test_batches_of_validation_have_the_form_of_the_training() -> None:
+    held_out = Scans("v", 3)
+    options: dict[str, Any] = {"to_sample": as_pair, "collate": in_pairs}
+    data = module.MixedData(
+        MixedScans(Scans("r", REAL), Endless(), **options), val=held_out, batch_size=3
+    )
+    for _ in range(2):
+        [batch] = data.val_dataloader()
+        assert batch["second"][:, 0, 0].tolist() == [len(scan) for scan in held_out]
+        tops = [float(scan.points.max()) + 1 for scan in held_out]
+        assert batch["first"][:, 0, 0].tolist() == pytest.approx(tops)
+    wrapped = MixedScans.wrap(Wrapped(), Endless(), **options)
+    [batch] = module.MixedData(wrapped, test=Wrapped(), batch_size=3).test_dataloader()
+    assert batch["first"][:, 0, 0].tolist() == [0, 1, 2]
+
+
 def test_batches_that_are_overfitted_stay_the_same() -> None:
     mixed = MixedScans(Scans("r", REAL), Endless(), ratio=0.25, seed=1)
     model = fit(module.MixedData(mixed, batch_size=4), overfit_batches=2)
@@ -303,6 +339,10 @@ class Shared(Model):
             )
         )
 
+    def validation_step(self, batch: Any, index: int) -> None:
+        with (self.out / f"val-{self.global_rank}.txt").open("a") as file:
+            print(*batch["id"], file=file)
+
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("own", [True, False])
@@ -311,7 +351,7 @@ def test_two_processes_see_every_sample(own: bool, tmp_path: Path) -> None:
     loader."""
     mixed = MixedScans(Scans("r", 10), Endless(), ratio=0.25, seed=1)
     data: Any = (
-        module.MixedData(mixed, batch_size=3)
+        module.MixedData(mixed, val=Scans("v", 3), batch_size=3)
         if own
         else DataLoader(mixed, 3, collate_fn=mixed.collate)
     )
@@ -324,6 +364,8 @@ def test_two_processes_see_every_sample(own: bool, tmp_path: Path) -> None:
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
+        num_sanity_val_steps=0,
+        check_val_every_n_epoch=2,
         use_distributed_sampler=not own,
     ).fit(Shared(tmp_path), data)
     for epoch in (0, 1):
@@ -338,6 +380,9 @@ def test_two_processes_see_every_sample(own: bool, tmp_path: Path) -> None:
             for d, i in zip(made.domain, made.index, strict=True)
         ]
         assert sorted(seen) == sorted(wanted)
+    if own:  # the share of each is as long as that of the other
+        shares = [(tmp_path / f"val-{rank}.txt").read_text().split() for rank in (0, 1)]
+        assert shares == [["v0", "v2"], ["v1", "v0"]]
 
 
 @pytest.mark.filterwarnings("ignore")
