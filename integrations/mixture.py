@@ -92,6 +92,14 @@ def synthetic_epoch(mixed: MixedScans, epoch: int = 0) -> int | None:
     return next((e for e in tried if MixingPlan(mixed.mixture, e).synthetics), None)
 
 
+def first_synthetic(mixed: MixedScans, count: int) -> Iterator[Any]:
+    """Up to ``count`` synthetic samples of the first epoch that has some, for checks before a
+    training."""
+    if (epoch := synthetic_epoch(mixed)) is not None:
+        for position in np.flatnonzero(mixed.plan(epoch).domain)[:count].tolist():
+            yield mixed.sample(epoch, position)
+
+
 def trainer_ids(
     learning_map: Mapping[int, int], taxonomy: Taxonomy, table: NDArray[Any]
 ) -> NDArray[Any]:

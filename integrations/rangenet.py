@@ -22,6 +22,7 @@ import numpy as np
 from lidar_synth.integrations.launcher import plain_errors, prepare_script, run
 from lidar_synth.integrations.mixture import (
     MixedEpoch,
+    first_synthetic,
     mix_for_trainer,
     points_of,
     read_settings,
@@ -140,9 +141,7 @@ def check_stripes(dataset: Any) -> None:
     Raises:
         ConfigError: at such a width; the error names one that fits.
     """
-    synthetic = [
-        dataset.mixed[int(i)] for i in np.flatnonzero(dataset.mixed.plan().domain)[:3]
-    ]
+    synthetic = list(first_synthetic(dataset.mixed, 3))
     real = list(dataset.scan_files[:3])
     if not (synthetic and real):
         return

@@ -252,12 +252,15 @@ def sensor_of(width: int) -> Any:
 
 def test_a_width_with_stripes_is_refused(made: Path, dense: Path) -> None:
     """At 512 columns a synthetic scan of 256 fills every second one; a real scan of 512 fills
-    all."""
-    with pytest.raises(
-        ConfigError,
-        match=rf"empty cell to the right.*img_prop.width: {SENSOR.columns} in",
-    ):
-        parser(dense, sensor=sensor_of(2 * SENSOR.columns))
+    all. It is refused before the first epoch, also if that has real scans alone."""
+    options = arguments(dense, sensor=sensor_of(2 * SENSOR.columns))
+    for ratio in (0.4, {0: 0.0, 3: 0.4}):
+        settings = {"synthetic": dense / "synthetic", "ratio": ratio}
+        with pytest.raises(
+            ConfigError,
+            match=rf"empty cell to the right.*img_prop.width: {SENSOR.columns} in",
+        ):
+            make_parser(stock, settings)(**options)
     parser(dense)  # both kinds in images of the synthetic scans' width
     # Stripes in both kinds do not tell them apart.
     parser(made, sensor=sensor_of(2 * SENSOR.columns))
