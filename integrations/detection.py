@@ -36,6 +36,11 @@ LEVELS = ((40, 0.15, 0), (25, 0.30, 1), (25, 0.50, 2))
 """KITTI's easy, moderate and hard: minimum height in pixels, maximum truncation and occlusion
 (devkit's readme)."""
 
+LOOKED_AT = 16
+"""Maximum number of synthetic scans whose boxes are checked before training."""
+
+BOXES_HINT = "labels: paste with a bank of objects gives a scan boxes, labels: boxes keeps its own."
+
 Origin = Literal["gravity", "bottom"]
 """The reference point of a box: its centre of gravity (OpenPCDet) or the centre of its floor
 (MMDetection3D)."""
@@ -79,23 +84,30 @@ def _lowest(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return points[order[np.r_[True, np.diff(cell[order]) != 0]]]
 
 
-def check_names(scan: Scan, classes: Collection[str]) -> None:
-    """Check that boxes have classes of the trainer, which would otherwise drop all of them
-    silently.
+def require_boxes(scan: Scan, known: Collection[str]) -> Boxes:
+    """The boxes of a synthetic scan, for a detector; they may be zero in number.
+
+    Args:
+        scan: a synthetic scan.
+        known: the class names that the trainer knows; it drops boxes of others silently, and their
+            points become background.
 
     Raises:
-        DataError: if there are boxes, but none of these classes.
+        DataError: if ``scan.boxes`` is None, or on a box with another name.
     """
-    if (
-        scan.boxes is not None
-        and len(scan.boxes)
-        and not set(scan.boxes.names) & set(classes)
-    ):
+    if scan.boxes is None:
         raise DataError(
-            f"boxes of {sorted(set(scan.boxes.names))} in synthetic scan {scan.id!r}",
-            f"some of {', '.join(classes)}",
-            "Rename the boxes to the trainer's classes.",
+            f"synthetic scan {scan.id!r} has no boxes",
+            "boxes, or every object in it would be background",
+            BOXES_HINT,
         )
+    if lost := sorted(set(scan.boxes.names) - set(known)):
+        raise DataError(
+            f"boxes of {lost} in synthetic scan {scan.id!r}",
+            f"some of {', '.join(known)}",
+            "The trainer drops boxes of other names. Rename them to its classes.",
+        )
+    return scan.boxes
 
 
 def plane_in_camera(

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.detection import check_names, ground_plane
+from lidar_synth.integrations.detection import ground_plane, require_boxes
 from lidar_synth.integrations.mixture import id_table, inner, require_ids
 from lidar_synth.integrations.mmdet3d_slots import (
     PREFIX,
@@ -30,7 +30,6 @@ from lidar_synth.integrations.mmdet3d_slots import (
     is_mixed,
     open_folder,
     read_url,
-    require_boxes,
     scan_of,
     split_url,
 )
@@ -129,13 +128,10 @@ class SynthBoxes:
         return info
 
     def _annotations(self, scan: Scan) -> dict[str, Any]:
-        given, known = require_boxes(scan), self.METAINFO["classes"]  # type: ignore[attr-defined]
-        check_names(scan, known)
+        known = self.METAINFO["classes"]  # type: ignore[attr-defined]
+        given = require_boxes(scan, known)
         mapping = self.label_mapping  # type: ignore[attr-defined]
-        labels = np.array(
-            [mapping[known.index(n)] if n in known else -1 for n in given.names],
-            np.int64,
-        ).reshape(-1)
+        labels = np.array([mapping[known.index(n)] for n in given.names], np.int64)
         values = given.values
         # nothing moves in the sweeps of a synthetic scan
         if getattr(self, "with_velocity", False):

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.detection import check_names
+from lidar_synth.integrations.detection import LOOKED_AT, require_boxes
 from lidar_synth.integrations.mixture import refuse_unlabelled
 from lidar_synth.integrations.mmdet3d_slots import (
     FORMATS,
@@ -25,7 +25,6 @@ from lidar_synth.integrations.mmdet3d_slots import (
     PREFIX,
     SlotFolder,
     open_folder,
-    require_boxes,
 )
 
 from lidar_synth.errors import ConfigError, DataError, FileError
@@ -73,7 +72,7 @@ def write_infos(
         ConfigError: on labels that make a loss NaN, or a ratio that is no number, list or {epoch:
             ratio}; on ``view=True`` without a camera.
         DataError: on a list without entries, or of another format; for detection, on synthetic
-            scans without boxes.
+            scans without boxes, or with boxes of names that the trainer does not know.
         FileError: if the scan of the first entry, or its labels, do not exist and the ratio is
             below 1.
     """
@@ -103,9 +102,8 @@ def write_infos(
     facts["layout"] = _layout(given, entries[0], layout, real)
     facts["view"] = None if view is False else camera
     folder = SlotFolder(out, facts)
-    if detects and folder.slots:
-        require_boxes(folder.scan(0))
-        check_names(folder.scan(0), folder.layout.classes)
+    for slot in range(min(folder.slots, LOOKED_AT) if detects else 0):
+        require_boxes(folder.scan(slot), folder.layout.classes)
     slots = [
         _slot(out, i, folder.layout.features, entries[i % len(entries)], detects)
         for i in range(folder.slots)

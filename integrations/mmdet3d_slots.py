@@ -31,7 +31,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_text
 from lidar_synth.formats.calibration import Calibration, in_view
 from lidar_synth.formats.point_labels import encode_labels
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing.schedules import settled
 
 PREFIX = "lsynth://"
@@ -274,22 +274,6 @@ def is_mixed(folder: Path) -> bool:
 def scan_of(source: str, number: int) -> Scan:
     """The scan that a URL names."""
     return open_folder(Path(source)).scan(number)
-
-
-def require_boxes(scan: Scan) -> Boxes:
-    """The boxes of a synthetic scan, for a detector; they may be zero in number.
-
-    Raises:
-        DataError: if ``scan.boxes`` is None.
-    """
-    if scan.boxes is None:
-        raise DataError(
-            f"synthetic scan {scan.id!r} has no boxes",
-            "boxes, for a detector",
-            "Write the list with labels='paste' and a bank of objects, or labels='boxes' if the "
-            "scans have boxes.",
-        )
-    return scan.boxes
 
 
 def _arrays(camera: dict[str, Any]) -> dict[str, Any]:

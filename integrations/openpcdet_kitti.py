@@ -4,7 +4,11 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.detection import ground_plane, plane_in_camera
+from lidar_synth.integrations.detection import (
+    ground_plane,
+    plane_in_camera,
+    require_boxes,
+)
 from lidar_synth.integrations.mixture import points_of
 from lidar_synth.integrations.mmdet3d_lists import CLASSES
 from lidar_synth.integrations.openpcdet_mixture import MixedDetection
@@ -39,7 +43,7 @@ class MixedKitti(MixedDetection, KittiDataset):  # type: ignore[misc]
         scan = (
             in_view(scan, self._view[1]) if self.dataset_cfg.FOV_POINTS_ONLY else scan
         )
-        assert scan.boxes is not None
+        boxes = require_boxes(scan, self.known)
         plane = plane_in_camera(ground_plane(scan), self._view[1])
         calib = self._view[0]
         image_shape = self._view[2]
@@ -49,8 +53,8 @@ class MixedKitti(MixedDetection, KittiDataset):  # type: ignore[misc]
                 "calib": deepcopy(calib),
                 "points": points_of(scan),
                 "road_plane": plane,
-                "gt_boxes": scan.boxes.values.copy(),
-                "gt_names": np.array(scan.boxes.names, dtype=str),
+                "gt_boxes": boxes.values.copy(),
+                "gt_names": np.array(boxes.names, dtype=str),
             }
         )
         sample["image_shape"] = image_shape.copy()

@@ -5,17 +5,21 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.mixture import mix_for_trainer, read_settings
+from lidar_synth.integrations.detection import BOXES_HINT, LOOKED_AT, require_boxes
+from lidar_synth.integrations.mixture import (
+    MixedEpoch,
+    first_synthetic,
+    mix_for_trainer,
+    read_settings,
+    synthetic_epoch,
+)
 from lidar_synth.integrations.weights import KEY
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
 
-LOOKED_AT = 16
-"""Number of synthetic scans among which one has to have a box, if GT sampling adds none."""
 
-
-class MixedDetection:
+class MixedDetection(MixedEpoch):
     """A dataset of OpenPCDet mixed with synthetic scans; evaluation uses only real ones.
 
     Combine it with a dataset class of OpenPCDet, ``class MixedKitti(MixedDetection,
@@ -27,10 +31,11 @@ class MixedDetection:
     ``labels: paste`` gives synthetic scans boxes.
     """
 
+    known: Collection[str] = ()
+    """The class names that a box of a synthetic scan may have."""
     _current: int | None = None  # the position whose sample is being made
     # Processes a synthetic scan with the trainer's own augmentation.
     _synthetic: Callable[[Scan], Any]
-    mixed: Any = None
     weighed = False
     """Whether samples have a weight in the loss."""
     dataset_cfg: Any
@@ -40,10 +45,11 @@ class MixedDetection:
         """Make the mixture and check its first synthetic scans; ``known`` are the class names that
         a box may have."""
         settings = read_settings(self.dataset_cfg.get("LIDAR_SYNTH", None))
-        real: int = super().__len__()  # type: ignore[misc]
+        real: int = super().__len__()
         self.weighed = KEY in settings
         self.mixed = mix_for_trainer(real, settings, weighs=True)
-        self._check_boxes({*self.class_names, *known})
+        self.known = sorted({*self.class_names, *known})
+        self._check_boxes()
 
     def merge_all_iters_to_one_epoch(
         self, merge: bool = True, epochs: int | None = None
@@ -60,11 +66,6 @@ class MixedDetection:
             )
         super().merge_all_iters_to_one_epoch(merge, epochs)  # type: ignore[misc]
 
-    def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, also for workers."""
-        if self.mixed is not None:
-            self.mixed.set_epoch(epoch)
-
     def domain(self, index: int) -> int:
         """0 if the sample at ``index`` is real in this epoch, 1 if it is synthetic."""
         return (
@@ -74,7 +75,7 @@ class MixedDetection:
     def __len__(self) -> int:
         # While OpenPCDet's own code works, it counts real scans.
         if self.mixed is None or self._current is not None:
-            return int(super().__len__())  # type: ignore[misc]
+            return int(super(MixedEpoch, self).__len__())  # type: ignore[misc]
         return len(self.mixed)
 
     def __getitem__(self, index: int) -> Any:
@@ -108,35 +109,20 @@ class MixedDetection:
             "Use labels: paste with a bank of objects, and gt_sampling.",
         )
 
-    def _check_boxes(self, known: Collection[str]) -> None:
-        """Check that the first synthetic scans have boxes, and only of known classes."""
-        hint = (
-            "labels: paste with a bank of objects gives a scan boxes, labels: boxes keeps its "
-            "own."
-        )
-        used = False
-        for position in np.flatnonzero(self.mixed.plan().domain)[:LOOKED_AT]:
-            scan = self.mixed[int(position)]
-            if scan.boxes is None:
-                given = f"synthetic scan {scan.id!r} has no boxes"
-                raise DataError(
-                    given, "boxes, or every object in it would be background", hint
-                )
-            if lost := sorted(set(scan.boxes.names) - set(known)):
-                raise DataError(
-                    f"boxes of {lost} in synthetic scan {scan.id!r}",
-                    f"some of {', '.join(sorted(known))}",
-                    "OpenPCDet drops boxes of other names. Rename them to its classes.",
-                )
-            used = used or bool(self._trained_names(scan) & set(self.class_names))
-            if used or self._sampling():
+    def _check_boxes(self) -> None:
+        """Check that the first synthetic scans have boxes of known classes, and one that is
+        trained on, if GT sampling adds none."""
+        for scan in first_synthetic(self.mixed, LOOKED_AT):
+            require_boxes(scan, self.known)
+            if self._sampling() or self._trained_names(scan) & set(self.class_names):
                 return
-        if self.mixed.plan().synthetics and not used:
-            given = (
+        if synthetic_epoch(self.mixed) is not None:
+            raise DataError(
                 f"the first synthetic scans have no box of {list(self.class_names)}, and there is "
-                "no gt_sampling"
+                "no gt_sampling",
+                "boxes, for a detector",
+                BOXES_HINT,
             )
-            raise DataError(given, "boxes, for a detector", hint)
 
     def _trained_names(self, scan: Scan) -> set[str]:
         """The class names that a scan's boxes have for the trainer."""

@@ -4,6 +4,7 @@ import warnings
 from typing import Any
 
 import numpy as np
+from lidar_synth.integrations.detection import require_boxes
 from lidar_synth.integrations.nuscenes import NAMES, as_nuscenes, five_values
 from lidar_synth.integrations.openpcdet_mixture import MixedDetection
 from pcdet.datasets.nuscenes.nuscenes_dataset import NuScenesDataset
@@ -51,7 +52,7 @@ class MixedNuScenes(MixedDetection, NuScenesDataset):  # type: ignore[misc]
 
     def _synthetic(self, scan: Scan) -> Any:
         scan = as_nuscenes(scan)
-        assert scan.boxes is not None
+        boxes = require_boxes(scan, self.known)
         points = five_values(scan)
         points[:, 4] = 0  # the time, in place of the ring
         sample = self.prepare_data(
@@ -60,20 +61,20 @@ class MixedNuScenes(MixedDetection, NuScenesDataset):  # type: ignore[misc]
                 "frame_id": f"synthetic/{scan.id}",
                 "metadata": {"token": f"synthetic/{scan.id}"},
                 "gt_boxes": np.pad(
-                    scan.boxes.values.astype(float),
+                    boxes.values.astype(float),
                     ((0, 0), (0, 2)),
                     constant_values=np.nan,
                 ),
-                "gt_names": np.array(scan.boxes.names, dtype=str),
+                "gt_names": np.array(boxes.names, dtype=str),
             }
         )
-        boxes = sample["gt_boxes"]
+        values = sample["gt_boxes"]
         if self.dataset_cfg.get("SET_NAN_VELOCITY_TO_ZEROS", False):
-            boxes = np.nan_to_num(boxes)
+            values = np.nan_to_num(values)
         sample["gt_boxes"] = (
-            boxes
+            values
             if self.dataset_cfg.PRED_VELOCITY
-            else boxes[:, [0, 1, 2, 3, 4, 5, 6, -1]]
+            else values[:, [0, 1, 2, 3, 4, 5, 6, -1]]
         )
         return sample
 

@@ -16,7 +16,7 @@ import pytest
 import torch
 import yaml
 from banks import some_image, write_bank
-from lidar_synth.integrations.detection import check_names
+from lidar_synth.integrations.detection import require_boxes
 from lidar_synth.integrations.folders import MANIFEST, export_mixture, write_planes
 from lidar_synth.integrations.mixture import (
     VARIABLE,
@@ -161,13 +161,17 @@ def test_a_map_of_classes_that_does_not_fit_is_refused() -> None:
 def test_boxes_that_a_trainer_does_not_know_are_refused() -> None:
     scan = street(0)
     assert scan.boxes is not None
-    check_names(scan, ["Car", "Van"])
-    check_names(replace(scan, boxes=None), ["Van"])
-    check_names(street(0, boxes=False), ["Van"])
+    assert len(require_boxes(scan, ["Car", "Van"])) == 3
+    assert len(require_boxes(street(0, boxes=False), ["Van"])) == 0
     with pytest.raises(
         DataError, match="boxes of .'Car'. in synthetic scan .* some of Van, Truck"
     ):
-        check_names(scan, ["Van", "Truck"])
+        require_boxes(scan, ["Van", "Truck"])
+    some = replace(scan.boxes, names=("Car", "Car", "Bicycle"))
+    with pytest.raises(DataError, match=r"boxes of \['Bicycle'\] in synthetic scan"):
+        require_boxes(replace(scan, boxes=some), ["Car", "Van"])
+    with pytest.raises(DataError, match="has no boxes.*labels: paste"):
+        require_boxes(replace(scan, boxes=None), ["Car"])
 
 
 def test_points_are_memory_of_their_own() -> None:

@@ -466,7 +466,7 @@ def test_unsuitable_training_data_is_refused_before_training(
         )
     boxless = Path(tmp_path / "boxless")
     write_all("npz", boxless, [replace(street(i), boxes=None) for i in range(3)])
-    with pytest.raises(DataError, match="no boxes.*labels='paste'"):
+    with pytest.raises(DataError, match="no boxes.*labels: paste"):
         write_infos(
             tmp_path / "g",
             made / "kitti" / "train.json",

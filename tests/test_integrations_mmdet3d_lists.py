@@ -243,13 +243,28 @@ def test_lists_that_do_not_fit_are_refused(scans: Path, tmp_path: Path) -> None:
         )
     bare = tmp_path / "bare"
     write_all("npz", bare, [replace(street(i), boxes=None) for i in range(5)])
-    with pytest.raises(DataError, match="no boxes.*labels='paste'"):
+    with pytest.raises(DataError, match="no boxes.*labels: paste"):
         write_infos(
             tmp_path / "a",
             listed,
             MIX | {"synthetic": bare},
             data_root=tmp_path / "n",
             **WHERE,
+        )
+
+
+def test_a_box_of_an_unknown_class_is_refused_beside_known_ones(tmp_path: Path) -> None:
+    """Trap: the trainer would leave it out, and its points become background."""
+    listed = kitti_list(kitti(tmp_path / "k", REAL), tmp_path / "k" / "train.json")
+    scans = [street(i) for i in range(SLOTS)]
+    assert scans[2].boxes is not None
+    names = ("Car", "Bicycle", "Car")
+    scans[2] = replace(scans[2], boxes=replace(scans[2].boxes, names=names))
+    write_all("npz", tmp_path / "s", scans)
+    where = {"data_root": tmp_path / "k", "points": "training/velodyne_reduced"}
+    with pytest.raises(DataError, match="boxes of .'Bicycle'. in synthetic scan"):
+        write_infos(
+            tmp_path / "m", listed, MIX | {"synthetic": tmp_path / "s"}, **where
         )
 
 

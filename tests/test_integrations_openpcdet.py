@@ -352,7 +352,7 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(
     write_all("npz", tmp_path / "some", some)
     with pytest.raises(
         DataError,
-        match="boxes of .'car'. in synthetic scan .* OpenPCDet drops boxes of other names",
+        match="boxes of .'car'. in synthetic scan .* The trainer drops boxes of other names",
     ):
         build(made, tmp_path / "some")
     with pytest.raises(
