@@ -187,7 +187,8 @@ def write_gt_database(
             continue
         box, values = _gt_object(objects, i, origin, layout)
         scan = re.sub(r"\W+", "_", str(objects.scan[i]))
-        path = f"{folder}/{scan}_{name}_{objects.number[i]}.bin"
+        # Numbered in the bank, as scans of two folders may have one name.
+        path = f"{folder}/{scan}_{name}_{i}.bin"
         write_file(root / path, values.astype("<f4").tobytes())
         facts = {
             "name": name,
