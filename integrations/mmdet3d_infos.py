@@ -33,6 +33,9 @@ from lidar_synth.files.parsing import parse_json
 
 Entry = dict[str, Any]
 
+PATHS = "synthetic", "root", "cache", "bank", "real", "as_sensor", "sensor", "like"
+"""Settings that may be paths."""
+
 
 def write_infos(
     out: str | Path,
@@ -69,8 +72,8 @@ def write_infos(
         The mixed list, for ``ann_file``.
 
     Raises:
-        ConfigError: on labels that make a loss NaN, or a ratio that is no number, list or {epoch:
-            ratio}; on ``view=True`` without a camera.
+        ConfigError: on labels that make a loss NaN, a ratio that is no number, list or {epoch:
+            ratio}, or objects among the settings; on ``view=True`` without a camera.
         DataError: on a list without entries, or of another format; for detection, on synthetic
             scans without boxes, or with boxes of names that the trainer does not know.
         FileError: if the scan of the first entry, or its labels, do not exist and the ratio is
@@ -97,7 +100,7 @@ def write_infos(
     facts: dict[str, Any] = {
         "format": FORMATS[-1],
         "real": len(entries),
-        "settings": _absolute(settings),
+        "settings": _stored(settings),
     }
     facts["layout"] = _layout(given, entries[0], layout, real)
     facts["view"] = None if view is False else camera
@@ -129,18 +132,38 @@ def _read(real: str | Path) -> Any:
     return load(str(real))
 
 
-def _absolute(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings with absolute paths to the synthetic scans and a sensor."""
+def _stored(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings as a list keeps them: plain values, paths absolute."""
     if not isinstance(settings.get("ratio"), int | float | list | dict | None):
         raise ConfigError(
             f"ratio={settings['ratio']!r} for a list",
             "a number, a list or {epoch: ratio}",
         )
-    settings = dict(settings)
-    for name in ("synthetic", "as_sensor"):
-        if isinstance(where := settings.get(name), str | Path) and Path(where).exists():
-            settings[name] = str(Path(where).resolve())
-    return settings
+    stored: dict[str, Any] = _absolute(settings)
+    try:
+        json.dumps(stored)
+    except TypeError as error:
+        raise ConfigError(
+            f"settings of a list that cannot be written: {error}",
+            "plain values, as in YAML",
+            "A policy by its name: labels={'paste': {'bank': FILE}}.",
+        ) from error
+    return stored
+
+
+def _absolute(value: Any, name: Any = None) -> Any:
+    """A setting, and those within it, with absolute paths; ``name`` is its key."""
+    if isinstance(value, dict):
+        return {key: _absolute(each, key) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_absolute(each, name) for each in value]
+    path = isinstance(value, Path) or (
+        isinstance(value, str)
+        and str(name).lower() in PATHS
+        and (name, value) != ("bank", "town")  # shipped with the package
+        and (name == "cache" or Path(value).exists())
+    )
+    return str(Path(value).resolve()) if path else value
 
 
 def _layout(

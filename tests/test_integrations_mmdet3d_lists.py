@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from banks import some_image, write_bank
 from layouts import MAKERS, write_all
 from lidar_synth.integrations.detection import write_gt_database
 from lidar_synth.integrations.mmdet3d_infos import write_infos
@@ -27,6 +28,7 @@ from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import NuScenes, open_scans
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.labels import ObjectBank
+from lidar_synth.labels.mix import PasteObjects
 
 REAL = 4
 SLOTS = 4
@@ -336,6 +338,32 @@ def test_a_list_may_begin_with_real_scans_alone(scans: Path, tmp_path: Path) -> 
     assert early.slots == REAL
     for slot in range(REAL):
         assert early.scan(slot).id == late.scan(slot).id
+
+
+@pytest.mark.parametrize("cached", [False, True])
+def test_a_list_is_read_from_another_folder(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cached: bool
+) -> None:
+    """Its settings name files relative to where it was written, also within others."""
+    ObjectBank.from_scans(open_scans(scans)).save(tmp_path / "objects.npz")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    write_bank(Path("bank"), [some_image(i) for i in range(4)])
+    listed = nuscenes_like(tmp_path / "n")
+    mix = MIX | {
+        "synthetic": {"root": "bank"},
+        "labels": {"paste": {"bank": Path("objects.npz"), "count": 2}},
+    }
+    if cached:
+        url = (tmp_path / "bank").as_uri()
+        mix["synthetic"] = {"root": url, "cache": "cache"}
+    write_infos("m", listed, mix, data_root="n", **WHERE)
+    monkeypatch.chdir("elsewhere")
+    folder = SlotFolder.open(tmp_path / "m")
+    assert folder.scan(0).boxes is not None and not list(Path().iterdir())
+    mix["labels"] = PasteObjects("town", count=2)
+    with pytest.raises(ConfigError, match="PasteObjects.*plain values.*{'paste'"):
+        write_infos("m", listed, mix, data_root=tmp_path / "n", **WHERE)
 
 
 @pytest.mark.parametrize("ratio", [0, {0: 0.0, 5: 0.0}])
