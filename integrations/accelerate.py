@@ -98,6 +98,12 @@ class _Prepared(DataLoaderShard):  # type: ignore[misc]
         self._current.follow(self)
         self._pass = (0, 0)  # an epoch, and number of its batches done
 
+    def begin(self) -> None:
+        """Begin a pass; none of its samples is a repeated one for ``gather_for_metrics`` to
+        drop."""
+        super().begin()
+        self.remainder = 0
+
     def __iter__(self) -> Iterator[Any]:
         epoch = self.iteration
         for done, batch in enumerate(super().__iter__(), 1):

@@ -33,20 +33,20 @@ def number(scan: Scan, rng: Any) -> torch.Tensor:
     return torch.tensor(-1 - own if scan.domain else own)
 
 
-def mixed() -> MixedScans:
-    """47 samples an epoch."""
+def mixed(epoch_size: int = 47) -> MixedScans:
+    """Of 47 samples an epoch."""
     return MixedScans(
         Scans("r", 37),
         Endless(),
         FALLING,
-        epoch_size=47,
+        epoch_size=epoch_size,
         to_sample=number,
         collate=torch.stack,
     )
 
 
-def planned(epoch: int, start: int = 0) -> list[int]:
-    made = mixed().plan(epoch)
+def planned(epoch: int, start: int = 0, size: int = 47) -> list[int]:
+    made = mixed(size).plan(epoch)
     both = zip(made.domain.tolist(), made.index.tolist(), strict=True)
     return [-1 - i if d else i for d, i in both][start:]
 
@@ -90,6 +90,7 @@ def run(rank: int, port: int) -> None:
     try:
         assert accelerator.num_processes == 2
         check_prepared(accelerator)
+        check_metrics(accelerator)
         check_refusals(accelerator)
         check_unprepared(accelerator)
     finally:
@@ -111,6 +112,19 @@ def check_prepared(accelerator: Any) -> None:
             assert seen(loader) == Counter(planned(2))
             loader.set_epoch(6)
             assert seen(loader) == Counter(planned(6))
+
+
+def check_metrics(accelerator: Any) -> None:
+    """What is gathered for metrics are all samples, each once, also of a last step that is not
+    full."""
+    for size, make in ((9, batched), (11, batched), (11, streamed), (47, streamed)):
+        train = mixed(size)
+        loader = prepare(accelerator, make(train, 0))
+        gathered = []
+        for batch in loader:
+            same = accelerator.pad_across_processes(batch, pad_index=1000)
+            gathered += accelerator.gather_for_metrics(same).tolist()
+        assert sorted(x for x in gathered if x != 1000) == sorted(planned(0, size=size))
 
 
 def check_refusals(accelerator: Any) -> None:
