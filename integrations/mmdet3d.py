@@ -34,6 +34,7 @@ from lidar_synth.integrations.mmdet3d_slots import (
     split_url,
 )
 from lidar_synth.integrations.weights import KEY, weigh_mmdet3d
+from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.geometry.scan import Scan
@@ -224,7 +225,7 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
         order = (
             super().__iter__()
             if self.planned is None
-            else self._planned(self.planned.entries(epoch).tolist())
+            else self._planned(self.planned.entries(epoch))
         )
         return ((epoch, index) for index in islice(order, start, None))
 
@@ -233,9 +234,10 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
         synthetic = float(self.folders[0].mixed.synthetic_weight(self.epoch))
         return [synthetic if path.startswith(PREFIX) else 1.0 for path in paths]
 
-    def _planned(self, entries: list[int]) -> Iterator[int]:
-        """This process's entries; the first ones once more where all processes need as many."""
-        return iter((entries + entries)[self.rank : self.total_size : self.world_size])
+    def _planned(self, entries: NDArray[np.int64]) -> Iterator[int]:
+        """This process's entries; the first ones again where all processes need as many."""
+        whole = np.resize(entries, self.total_size)
+        return iter(whole[self.rank :: self.world_size].tolist())
 
 
 class Fetch:

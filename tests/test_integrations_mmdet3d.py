@@ -373,6 +373,27 @@ def test_partners_follow_the_schedule(
         assert len(drawn) == 2 * REAL and {i < REAL for i in drawn} == {epoch == 1}
 
 
+@pytest.mark.parametrize("ranks", [2, 8])
+def test_every_rank_has_as_many_samples(made: Path, tmp_path: Path, ranks: int) -> None:
+    """Also more ranks than twice the samples of an epoch."""
+    settings = {"synthetic": made / "synthetic", "ratio": 0.5, "epoch_size": 3}
+    where = {"data_root": made / "sk"}
+    listed = write_infos(
+        tmp_path / "seg", made / "sk" / "train.json", settings, **where
+    )
+    sampler = adapter.SynthSampler(segmentation(made, [PACK], ann_file=str(listed)))
+    sampler.world_size = ranks
+    sampler.num_samples = -(-3 // ranks)
+    sampler.total_size = sampler.num_samples * ranks
+    given = []
+    for rank in range(ranks):
+        sampler.rank = rank
+        given.append([index for _, index in sampler])
+    assert {len(share) for share in given} == {sampler.num_samples}
+    drawn = {index for share in given for index in share}
+    assert drawn == set(sampler.planned.entries(0).tolist())
+
+
 def test_scans_without_a_box_are_not_replaced(made: Path, tmp_path: Path) -> None:
     """Trap: the stock setting replaces them, before ObjectSample can give them any, and the ratio
     is gone."""
