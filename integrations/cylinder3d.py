@@ -69,11 +69,11 @@ def register() -> Any:
                 self.mixed = mix_for_trainer(len(self.im_idx), settings)
 
         def __getitem__(self, index: int) -> Any:
-            sample = index if self.mixed is None else self.mixed[index]
-            if not isinstance(sample, Scan):
-                return super().__getitem__(sample)
-            points = points_of(sample)
-            label = class_ids(sample, self._ids)[:, None]
+            return self._take(index, super().__getitem__)
+
+        def _synthetic(self, scan: Scan) -> Any:
+            points = points_of(scan)
+            label = class_ids(scan, self._ids)[:, None]
             if self.return_ref:
                 return (points[:, :3], label, points[:, 3])
             return (points[:, :3], label)

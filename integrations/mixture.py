@@ -6,7 +6,7 @@ In a trainer's configuration, a mixture is a dict of settings::
     {"synthetic": "bank/", "ratio": 0.25, "labels": "generated", "seed": 0}
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from typing import Any
 
@@ -128,6 +128,12 @@ def trainer_ids(
     return ids
 
 
+def labels_scans(settings: Mapping[str, Any]) -> bool:
+    """Whether synthetic scans have labels by the policy of the settings."""
+    policy = read_policy(settings.get("labels", "generated"))
+    return not isinstance(policy, RemoveLabels | IgnoreLabels)
+
+
 def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:
     """Refuse label policies with which a batch may have no valid label, because its loss would be
     NaN.
@@ -135,8 +141,7 @@ def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:
     Raises:
         ConfigError: on the policies ``none`` and ``ignore``.
     """
-    policy = read_policy(settings.get("labels", "generated"))
-    if isinstance(policy, RemoveLabels | IgnoreLabels):
+    if not labels_scans(settings):
         raise ConfigError(
             f"labels={settings['labels']!r} for {trainer}",
             "labels for every synthetic scan, such as 'generated' or 'condition'",
@@ -236,12 +241,19 @@ class MixedEpoch:
     """
 
     mixed: Any = None
+    # Makes the trainer's sample of a synthetic scan.
+    _synthetic: Callable[[Scan], Any]
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, also for workers."""
         if self.mixed is not None:
             self.mixed.set_epoch(epoch)
             self.mixed.plan()  # logs it
+
+    def _take(self, index: int, real: Callable[[int], Any]) -> Any:
+        """The sample at an index; ``real`` makes that of a real scan from its number."""
+        sample = index if self.mixed is None else self.mixed[index]
+        return self._synthetic(sample) if isinstance(sample, Scan) else real(sample)
 
     def __len__(self) -> int:
         if self.mixed is None:

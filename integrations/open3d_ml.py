@@ -102,15 +102,15 @@ def _split_class(stock: Any) -> Any:
 
         def get_data(self, idx: int) -> dict[str, Any]:
             """Points (N, 3), features (N, 1) float32 and labels (N,) int32, 0 = unlabelled."""
-            sample = self.mixed[idx]
-            if not isinstance(sample, Scan):
-                data: dict[str, Any] = super().get_data(sample)
-                return data
-            points = points_of(sample)
+            data: dict[str, Any] = self._take(idx, super().get_data)
+            return data
+
+        def _synthetic(self, scan: Scan) -> dict[str, Any]:
+            points = points_of(scan)
             return {
                 "point": points[:, :3],
                 "feat": points[:, 3:],
-                "label": class_ids(sample, _IDS),
+                "label": class_ids(scan, _IDS),
             }
 
         def get_attr(self, idx: int) -> dict[str, Any]:

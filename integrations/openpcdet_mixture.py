@@ -1,7 +1,7 @@
 """What OpenPCDet's mixed datasets share: which sample is at a position, and what is refused before
 training."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -34,8 +34,6 @@ class MixedDetection(MixedEpoch):
     known: Collection[str] = ()
     """The class names that a box of a synthetic scan may have."""
     _current: int | None = None  # the position whose sample is being made
-    # Processes a synthetic scan with the trainer's own augmentation.
-    _synthetic: Callable[[Scan], Any]
     weighed = False
     """Whether samples have a weight in the loss."""
     dataset_cfg: Any
@@ -85,10 +83,7 @@ class MixedDetection(MixedEpoch):
             return self._replacement(index)
         self._current = index % len(self.mixed)
         try:
-            sample = self.mixed[self._current]
-            synthetic = isinstance(sample, Scan)
-            make = self._synthetic if synthetic else super().__getitem__  # type: ignore[misc]
-            made = make(sample)
+            made = self._take(self._current, super().__getitem__)  # type: ignore[misc]
             if self.weighed:
                 made[KEY] = np.float32(self.mixed.loss_weight(self._current))
             return made

@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 from lidar_synth.integrations.mixture import (
+    MixedEpoch,
     class_ids,
     id_table,
     inner,
+    labels_scans,
     mix_for_trainer,
     points_of,
     read_settings,
@@ -59,7 +61,7 @@ copyreg.pickle(Config, lambda config: (read_config, (config.__getstate__(),)))
 
 
 @DATASETS.register_module()
-class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
+class MixedSemanticKITTI(MixedEpoch, SemanticKITTIDataset):  # type: ignore[misc]
     """``SemanticKITTIDataset`` with synthetic samples, for training.
 
     Args:
@@ -79,7 +81,7 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
             )
         super().__init__(**options)
         settings = read_settings(mixture)
-        self._labelled = settings.get("labels", "generated") not in ("none", "ignore")
+        self._labelled = labels_scans(settings)
         if collects_labels(options.get("transform")):
             refuse_unlabelled(settings, "Pointcept")
         taxonomy = take_classes(settings)
@@ -87,10 +89,6 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
             self.learning_map, taxonomy, id_table(0, self.ignore_index, np.int32)
         )
         self.mixed = mix_for_trainer(len(self.data_list), settings)
-
-    def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, also for workers, persistent ones included."""
-        self.mixed.set_epoch(epoch)
 
     def domain(self, index: int) -> int:
         """0 if the sample at ``index`` is real in this epoch, 1 if it is synthetic."""
@@ -102,18 +100,18 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
     def get_data(self, idx: int) -> dict[str, Any]:
         """Coordinates (N, 3), strength (N, 1) float32, segment (N,) int32 and a name, as Pointcept
         reads them."""
-        sample = self.mixed[idx % len(self.mixed)]
-        if not isinstance(sample, Scan):
-            data: dict[str, Any] = super().get_data(sample)
-            return data
-        points = points_of(sample)
+        data: dict[str, Any] = self._take(idx % len(self.mixed), super().get_data)
+        return data
+
+    def _synthetic(self, scan: Scan) -> dict[str, Any]:
+        points = points_of(scan)
         return {
             "coord": points[:, :3],
             "strength": points[:, 3:],
-            "segment": class_ids(sample, self._ids)
+            "segment": class_ids(scan, self._ids)
             if self._labelled
             else np.full(len(points), self._ids[IGNORE]),
-            "name": f"synthetic_{sample.id}",
+            "name": f"synthetic_{scan.id}",
         }
 
 

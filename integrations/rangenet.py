@@ -97,19 +97,19 @@ def dataset_class(stock: Any) -> Any:
             check_stripes(self)
 
         def __getitem__(self, index: int) -> Any:
-            sample = self.mixed[index]
-            if not isinstance(sample, Scan):
-                return super().__getitem__(sample)
-            if len(sample) > self.max_points:
+            return self._take(index, super().__getitem__)
+
+        def _synthetic(self, scan: Scan) -> Any:
+            if len(scan) > self.max_points:
                 raise ConfigError(
-                    f"max_points: {self.max_points} for a synthetic scan of {len(sample)} points",
+                    f"max_points: {self.max_points} for a synthetic scan of {len(scan)} points",
                     "room for all of them",
                     "Raise dataset.max_points in the architecture's YAML.",
                 )
             with tempfile.TemporaryDirectory(dir=_MEMORY) as folder:
                 files = self.scan_files, self.label_files
                 self.scan_files, self.label_files = (
-                    [path] for path in _write(Path(folder), sample, self.taxonomy)
+                    [path] for path in _write(Path(folder), scan, self.taxonomy)
                 )
                 try:
                     return super().__getitem__(0)

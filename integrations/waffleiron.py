@@ -68,15 +68,14 @@ def dataset_class(stock: Any) -> Any:
         def __load_pc_internal__(self, index: int) -> Any:
             """Points (N, 4) float32, labels (N,) int32 0..18 or 255, and instances (N,) uint32, 0 =
             none."""
-            if self.mixed is None:
-                return super().__load_pc_internal__(index)
-            sample = self.mixed[int(index)]
-            if not isinstance(sample, Scan):
-                return self.real.__load_pc_internal__(sample)
+            real: Any = super() if self.mixed is None else self.real
+            return self._take(int(index), real.__load_pc_internal__)
+
+        def _synthetic(self, scan: Scan) -> Any:
             return (
-                points_of(sample),
-                class_ids(sample, _IDS),
-                np.zeros(len(sample), np.uint32),
+                points_of(scan),
+                class_ids(scan, _IDS),
+                np.zeros(len(scan), np.uint32),
             )
 
         def load_pc(self, index: int) -> Any:
