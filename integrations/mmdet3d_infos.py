@@ -18,7 +18,7 @@ import numpy as np
 from lidar_synth.integrations.detection import LOOKED_AT, require_boxes
 from lidar_synth.integrations.mixture import refuse_unlabelled
 from lidar_synth.integrations.mmdet3d_slots import (
-    FORMATS,
+    FORMAT,
     INFOS,
     LAYOUTS,
     MIXTURE,
@@ -98,7 +98,7 @@ def write_infos(
     if balance:
         entries = _balanced(entries, int(settings.get("seed", 0)))
     facts: dict[str, Any] = {
-        "format": FORMATS[-1],
+        "format": FORMAT,
         "real": len(entries),
         "settings": _stored(settings),
     }

@@ -37,8 +37,8 @@ from lidar_synth.mixing.schedules import settled
 PREFIX = "lsynth://"
 MIXTURE = "mixture.json"
 INFOS = "infos.json"
-FORMATS = ("lidar-synth-mmdet3d/1", "lidar-synth-mmdet3d/2")
-"""Formats of ``mixture.json``: the second has a layout; the first is always KITTI's."""
+FORMAT = "lidar-synth-mmdet3d/2"
+"""The format of ``mixture.json``."""
 
 # number of scans in the cache of a process: points, labels and boxes of a scan are read one after
 # another
@@ -85,7 +85,7 @@ class SlotFolder:
         self.path = path
         self.settings = {k: _by_epoch(v) for k, v in facts["settings"].items()}
         self.real = int(facts["real"])
-        self.layout = LAYOUTS[facts.get("layout", "kitti")]
+        self.layout = LAYOUTS[facts["layout"]]
         self.mixed = mix_for_trainer(self.real, self.settings, weighs=True)
         some = synthetic_epoch(self.mixed) is not None
         self.slots = self.mixed.mixture.laps[0] if some else 0
@@ -105,10 +105,10 @@ class SlotFolder:
                 since.
         """
         facts = json.loads(read_text(path / MIXTURE))
-        if facts.get("format") not in FORMATS:
+        if facts.get("format") != FORMAT:
             raise DataError(
                 f"{path / MIXTURE} has format {facts.get('format')!r}",
-                " or ".join(FORMATS),
+                FORMAT,
                 "Write the list again.",
             )
         folder = cls(path, facts)

@@ -446,23 +446,16 @@ def test_a_list_holds_schedules_and_lengths(
         )
 
 
-def test_lists_of_the_first_format_stay_readable(scans: Path, tmp_path: Path) -> None:
+def test_lists_of_another_format_are_refused(scans: Path, tmp_path: Path) -> None:
     real = semantic_kitti_list(
         semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json"
     )
     write_infos(
         tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk"
     )
-    facts = json.loads((tmp_path / "m" / "mixture.json").read_text())
-    del facts["layout"]
-    (tmp_path / "m" / "mixture.json").write_text(
-        json.dumps(facts | {"format": "lidar-synth-mmdet3d/1"})
-    )
-    assert SlotFolder.open(tmp_path / "m").layout.features == 4
-    (tmp_path / "m" / "mixture.json").write_text(
-        json.dumps(facts | {"format": "lidar-synth-mmdet3d/3"})
-    )
-    with pytest.raises(DataError, match="mmdet3d/3.*Write the list again"):
+    path = tmp_path / "m" / "mixture.json"
+    path.write_text(path.read_text().replace("-mmdet3d/2", "-mmdet3d/1"))
+    with pytest.raises(DataError, match="mmdet3d/1.*Write the list again"):
         SlotFolder.open(tmp_path / "m")
 
 
