@@ -238,7 +238,7 @@ def test_the_hook_finds_mixtures_wherever_pointcept_puts_them(made: Path) -> Non
 def test_pretraining_takes_scans_without_labels(made: Path, tmp_path: Path) -> None:
     bare = synthetic(tmp_path / "bare", 3, labels=False)
     transform = [{"type": "ToTensor"}, {"type": "Collect", "keys": ["coord", "name"]}]
-    for labels in ("none", "ignore"):
+    for labels in ("none", "ignore", {"none": {}}):
         mixture = {"synthetic": str(bare), "ratio": 0.4, "labels": labels}
         dataset = build(made, mixture=mixture, transform=transform)
         position = next(i for i in range(len(dataset)) if dataset.domain(i))
