@@ -15,6 +15,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.lab.evaluate.objects import (
     Crop,
+    as_text,
     compare_objects,
     crop,
     crops,
@@ -143,6 +144,16 @@ def test_the_command_prints_a_table(sets: dict[str, Path]) -> None:
     assert f"| {values['car']['auc']:.2f} |" in shown
     twice = CliRunner().invoke(app, [*given, "--protocol", "town"])
     assert twice.exit_code == 2
+
+
+def test_scans_of_one_folder_are_one_place(sets: dict[str, Path]) -> None:
+    """Else the classifier would be asked about the objects that it has seen."""
+    real = open_scans(sets["real"])
+    flat = [replace(real[i], id=f"{i:06d}") for i in range(len(real))]
+    figures = compare_objects(flat, open_scans(sets["rough"]))
+    car = figures["car"]
+    assert (car["places"], car["auc"], car["floor"]) == (1, None, None)
+    assert "needs two places with 4 objects" in as_text(figures)
 
 
 def test_instances_without_boxes_are_judged_too(sets: dict[str, Path]) -> None:

@@ -122,14 +122,14 @@ def crops(scans: Source, name: str, placed: bool = True) -> list[Crop]:
     """The objects of a class in scans with boxes, or with labels and instances.
 
     Args:
-        scans: their place is what stands before the last "/" of an id.
+        scans: their place is what stands before the last "/" of an id, or one for all without.
         name: of ``CLASSES``.
         placed: False for generated scans, which have no places.
     """
     found = []
     for index in range(len(scans)):
         scan = scans[index]
-        place = scan.id.rpartition("/")[0] if placed else ""
+        place = (scan.id.rpartition("/")[0] or ".") if placed else ""
         for one in _objects(scan):
             if _label(one) == CLASSES[name]:
                 found.append(crop(one, place))
@@ -309,4 +309,6 @@ def as_text(figures: Mapping[str, Any]) -> str:
         lines.append(
             f"| {kind} | {row['pairs']} | {row['places']} | {' | '.join(cells)} |"
         )
+    if any(row["auc"] is None for row in figures.values()):
+        lines.append(f"\nAn AUC needs two places with {FEWEST} objects each.")
     return "\n".join(lines)
