@@ -468,8 +468,11 @@ def test_an_option_that_changes_the_scans_is_not_resumed_over(
 def test_a_folder_is_not_converted_into_itself(tmp_path: Path) -> None:
     write_all("kitti", tmp_path, [some_scan(0)])
     before = files(tmp_path)
-    with pytest.raises(ConfigError, match="source and output; expected another folder"):
-        convert(open_scans(tmp_path), WRITERS["kitti"](tmp_path), progress=False)
+    for out in (tmp_path, tmp_path / "below"):  # where a second call would read it
+        with pytest.raises(
+            ConfigError, match="inside of .*; expected a folder outside"
+        ):
+            convert(open_scans(tmp_path), WRITERS["kitti"](out), progress=False)
     assert files(tmp_path) == before and not (tmp_path / SETTINGS).exists()
 
 

@@ -25,7 +25,7 @@ def require_outside(out: Path, root: Path) -> None:
         ConfigError: if ``out`` is ``root`` or lies in it.
     """
     if out.resolve().is_relative_to(root.resolve()):
-        raise ConfigError(f"--out {out} inside of {root}", "a folder outside of it")
+        raise ConfigError(f"output {out} inside of {root}", "a folder outside of it")
 
 
 def claim(path: Path, settings: dict[str, Any]) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files.claims import hold_claim
+from lidar_synth.files.claims import hold_claim, require_outside
 from lidar_synth.files.disk import (
     join_inside,
     list_files,
@@ -153,16 +153,11 @@ class Writer(ABC):
         """Claim the folder by its file ``note``, as ``hold_claim`` does.
 
         Raises:
-            ConfigError: also if the source's folder is this one, or one that is claimed for the
+            ConfigError: also if this folder is in the source's, or one that is claimed for the
                 first time holds files like those of scans.
         """
-        if (
-            isinstance(source, ScanFiles)
-            and source.root.resolve() == self.root.resolve()
-        ):
-            raise ConfigError(
-                f"{self.root} as source and output", "another folder for the output"
-            )
+        if isinstance(source, ScanFiles):
+            require_outside(self.root, source.root)
         path = self.root / note
         there = self.root.rglob(f"*{self.path(0).suffix}")
         if not path.is_file() and (scan := next(there, None)):
