@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from lidar_synth.formats.kitti360_boxes import WorldBoxes
-from lidar_synth.formats.kitti360_poses import fill_poses, undo_ego_motion
+from lidar_synth.formats.kitti360_poses import fill_poses
 from lidar_synth.lab.kitti360.accumulated import read_cloud, write_cloud
 from lidar_synth.lab.kitti360.movers import Movers
+from lidar_synth.lab.kitti360.recovery import undo_ego_motion
 
 
 def test_undoing_the_motion_of_the_sensor_is_exact_at_the_pose_and_half_a_turn_away() -> (

@@ -25,11 +25,9 @@ from lidar_synth.formats.kitti360 import (
 )
 from lidar_synth.formats.kitti360_boxes import read_boxes
 from lidar_synth.formats.kitti360_poses import (
-    ego_motion,
     imu_from_sensor,
     read_calibration,
     read_poses,
-    undo_ego_motion,
 )
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import load_sensor
@@ -41,6 +39,7 @@ from lidar_synth.lab.kitti360.accumulated import (
     write_cloud,
 )
 from lidar_synth.lab.kitti360.labels import label_scans, plan_labels
+from lidar_synth.lab.kitti360.recovery import ego_motion, undo_ego_motion
 from lidar_synth.lab.kitti360.report import LabelReport
 from lidar_synth.lab.town import Town, export_town
 from lidar_synth.lab.town.accumulate import STEP, windows_of

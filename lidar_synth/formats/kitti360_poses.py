@@ -9,7 +9,7 @@ Files (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
     data_poses/DRIVE/cam0_to_world.txt  a frame and 16 numbers per line: rectified camera 0 to world
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -229,46 +229,3 @@ def fill_poses(
             end = poses[last][:3, 3]
             filled[frame][:3, 3] = (1 - share) * start + share * end
     return filled
-
-
-def ego_motion(
-    poses: Mapping[int, NDArray[np.float64]], frame: int
-) -> NDArray[np.float64]:
-    """(4, 4) the sensor of the frame before, in the frame of the sensor at ``frame``.
-
-    Without a pose of the frame before, the motion to the next frame is taken; without both, the car
-    stood still.
-    """
-    if frame - 1 in poses:
-        return np.asarray(np.linalg.inv(poses[frame]) @ poses[frame - 1])
-    if frame + 1 in poses:
-        return np.asarray(np.linalg.inv(poses[frame + 1]) @ poses[frame])
-    return np.eye(4)
-
-
-def undo_ego_motion(
-    points: NDArray[np.floating], motion: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Points of one revolution as seen from the sensor's place at the moment of the pose.
-
-    The sensor turns clockwise once per frame and looks ahead at the moment of the pose, so a point
-    at azimuth a (counter-clockwise from ahead) was measured a / 2 pi of a frame earlier. This is
-    the rule by which the dataset's own tool (kitti360Scripts, accumuLaser) accumulated its clouds.
-
-    Args:
-        points: (N, 3) metres, as measured.
-        motion: (4, 4) from ``ego_motion``.
-    """
-    share = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi))[:, None].astype(
-        np.float64
-    )
-    skew = (motion[:3, :3] - motion[:3, :3].T) / 2
-    sine = np.sqrt((skew**2).sum() / 2)
-    moved: NDArray[np.float64] = points + share * motion[:3, 3]
-    if sine > 0:  # Rodrigues' formula
-        angle = share * np.arcsin(min(sine, 1.0))
-        turned = points @ (skew.T / sine)
-        moved += np.sin(angle) * turned + (1 - np.cos(angle)) * (
-            turned @ (skew.T / sine)
-        )
-    return moved

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.formats.kitti360_boxes import WorldBoxes
-from lidar_synth.formats.kitti360_poses import ego_motion, undo_ego_motion
 from lidar_synth.lab.kitti360.accumulated import Window, cloud_values, read_cloud
 from lidar_synth.lab.kitti360.movers import FLOOR, MARGIN, Movers, find_inside
 from lidar_synth.lab.kitti360.nearest import Chunk, index_cloud
@@ -303,3 +302,46 @@ def _chunks(windows: Sequence[Window]) -> Iterator[Chunk]:
             points = np.column_stack([part[axis] for axis in "xyz"]).astype(np.float64)
             trust = np.clip(np.nan_to_num(part["confidence"]), 0, 1).astype(np.float32)
             yield points, cloud_values(part, str(window.static)), trust
+
+
+def ego_motion(
+    poses: Mapping[int, NDArray[np.float64]], frame: int
+) -> NDArray[np.float64]:
+    """(4, 4) the sensor of the frame before, in the frame of the sensor at ``frame``.
+
+    Without a pose of the frame before, the motion to the next frame is taken; without both, the car
+    stood still.
+    """
+    if frame - 1 in poses:
+        return np.asarray(np.linalg.inv(poses[frame]) @ poses[frame - 1])
+    if frame + 1 in poses:
+        return np.asarray(np.linalg.inv(poses[frame + 1]) @ poses[frame])
+    return np.eye(4)
+
+
+def undo_ego_motion(
+    points: NDArray[np.floating], motion: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points of one revolution as seen from the sensor's place at the moment of the pose.
+
+    The sensor turns clockwise once per frame and looks ahead at the moment of the pose, so a point
+    at azimuth a (counter-clockwise from ahead) was measured a / 2 pi of a frame earlier. This is
+    the rule by which the dataset's own tool (kitti360Scripts, accumuLaser) accumulated its clouds.
+
+    Args:
+        points: (N, 3) metres, as measured.
+        motion: (4, 4) from ``ego_motion``.
+    """
+    share = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi))[:, None].astype(
+        np.float64
+    )
+    skew = (motion[:3, :3] - motion[:3, :3].T) / 2
+    sine = np.sqrt((skew**2).sum() / 2)
+    moved: NDArray[np.float64] = points + share * motion[:3, 3]
+    if sine > 0:  # Rodrigues' formula
+        angle = share * np.arcsin(min(sine, 1.0))
+        turned = points @ (skew.T / sine)
+        moved += np.sin(angle) * turned + (1 - np.cos(angle)) * (
+            turned @ (skew.T / sine)
+        )
+    return moved
