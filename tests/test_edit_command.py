@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from box_scenes import car, cast, wall
 from layouts import write_all
@@ -9,6 +10,7 @@ from typer.testing import CliRunner
 
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.formats import open_scans
 
 SCAN = cast([car(12, 0, 0.3), car(-8, 8)], [wall(24, 0, 1.57, length=80)])
 
@@ -58,7 +60,10 @@ def test_a_scan_is_edited_once_in_a_folder_and_by_the_same_call(
     before = files(out)
     call(*first)
     assert files(out) == before
-    with pytest.raises(ConfigError, match=r"was filled with .*choose another folder"):
+    differs = (
+        r"was filled with {'box': \[0\]}; expected {'box': \[1\]}. .*another folder"
+    )
+    with pytest.raises(ConfigError, match=differs):
         call("remove", source, out, "--box", 1, "--scan", 0)
     assert files(out) == before
     call("move", source, out, "--box", 0, "--at", "14,-6", "--scan", 1)
@@ -78,7 +83,7 @@ def test_all_scans_are_edited_once_in_a_folder(source: Path, tmp_path: Path) -> 
 
 
 def test_a_class_without_a_box_writes_nothing(source: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="expected the class of some box"):
+    with pytest.raises(ConfigError, match="class of some box in these scans: Car$"):
         call("remove", source, tmp_path / "out", "--name", "Dragon")
     assert not (tmp_path / "out").exists()
     with pytest.raises(DataError, match=r"box \[500\]"):
@@ -91,3 +96,35 @@ def test_what_the_format_cannot_hold_is_named(source: Path, tmp_path: Path) -> N
     assert "dropped boxes of 2 scans, which kitti cannot hold" in told
     objects = call("remove", source, tmp_path / "o", "--box", 0, "--to", "kitti_object")
     assert "dropped boxes outside the camera's view of 2 scans" in objects
+
+
+@pytest.mark.parametrize(
+    "verb", [("move", "--box", 0, "--at", "14,-6"), ("remove", "--box", 0)]
+)
+def test_scans_are_read_with_the_options_of_other_commands(
+    verb: tuple[object, ...], tmp_path: Path
+) -> None:
+    write_all("kitti_object", tmp_path / "in", [SCAN])
+    [path] = (tmp_path / "in").rglob("*.bin")
+    points = np.fromfile(path, np.float32).reshape(-1, 4)
+    (points * np.float32([1, 1, 1, 255])).tofile(path)
+    name, *words = verb
+    given = (name, tmp_path / "in", tmp_path / "out", *words, "--scan", 0)
+    with pytest.raises(DataError, match="--reflectance-max 255"):
+        call(*given)
+    call(*given, "--reflectance-max", 255, "--sensor", SCAN.sensor.name)
+    edited = open_scans(tmp_path / "out")[0]
+    assert edited.sensor == SCAN.sensor and edited.reflectance.max() <= 1
+
+
+def test_scans_that_cannot_be_read_are_left_out_on_request(
+    source: Path, tmp_path: Path
+) -> None:
+    first, *_ = sorted(source.rglob("*.npz"))
+    first.write_bytes(b"PK")
+    given = ("remove", source, tmp_path / "out", "--box", 0)
+    assert "1 scans written, 0 were there already, 1 skipped" in call(
+        *given, "--on-bad", "skip"
+    )
+    [name] = open_scans(tmp_path / "out").ids
+    assert name == open_scans(source).ids[1]

@@ -177,14 +177,10 @@ def _change(
     from lidar_synth.formats.as_sensor import AsSensor, make_transfer
 
     if as_sensor is None:
-        given = {
-            k: v
-            for k, v in {"mount": mount, "sweeps": sweeps, "like": like, **how}.items()
-            if v
-        }
-        if given:
+        given = {"mount": mount, "sweeps": sweeps, "like": like, **how}
+        if any(given.values()):
             raise ConfigError(
-                f"{', '.join(given)} without --as-sensor",
+                f"{', '.join(filter(given.get, given))} without --as-sensor",
                 "the sensor that the scans are turned into",
             )
         return None

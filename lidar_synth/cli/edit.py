@@ -1,20 +1,28 @@
 """``lidar-synth edit``: removes objects from scans, sets them into scans and moves them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.convert import print_report, read_numbers
-from lidar_synth.cli.options import Format, Out, Source
+from lidar_synth.cli.convert import InputSensor, print_report, read_numbers
+from lidar_synth.cli.options import (
+    Format,
+    Out,
+    Reading,
+    Source,
+    drop_missing,
+    options_from,
+)
 
 if TYPE_CHECKING:
     from lidar_synth.geometry.scan import Scan
 
 edit = typer.Typer(
     name="edit",
-    help="Surgery on scans: remove, insert and move objects with their boxes.",
+    help="Surgery on scans: remove, insert and move objects with their boxes. A folder takes one "
+    "edit of a scan.",
     no_args_is_help=True,
 )
 
@@ -36,6 +44,7 @@ Place = Annotated[
 
 
 @edit.command("remove")
+@options_from(Reading, after="sensor")
 def remove_objects(
     context: typer.Context,
     source: Source,
@@ -53,13 +62,15 @@ def remove_objects(
     model: Model = None,
     seed: Seed = 0,
     to: Format = "npz",
+    sensor: InputSensor = None,
+    **reading: Any,
 ) -> None:
     """Removes objects by their boxes, and fills the holes with what is behind them.
 
     \b
     Examples:
       lidar-synth edit remove KITTI out --name Car --to kitti_object
-      lidar-synth edit remove town out --scan 0 --box 3 --model town
+      lidar-synth edit remove town out --scan 0 --box 3 --model town --sensor hdl64e_lasers
     """
     from lidar_synth.errors import ConfigError
     from lidar_synth.labels.edit import remove
@@ -74,17 +85,18 @@ def remove_objects(
         count += len(numbers)
         return remove(given, numbers, model=model, seed=seed)
 
-    _edit(context, source, out, scan, to, change, name)
+    _edit(context, change)
     print(f"{out}: {count} objects removed")
 
 
 @edit.command("insert")
+@options_from(Reading, after="sensor")
 def insert_object(
     context: typer.Context,
     source: Source,
     out: Out,
     objects: Annotated[
-        Path, typer.Option(help="a bank of objects, .npz, of ObjectBank.save")
+        str, typer.Option(help="a bank of objects, .npz, of ObjectBank.save")
     ],
     at: Place,
     number: Annotated[
@@ -92,6 +104,8 @@ def insert_object(
     ] = 0,
     scan: ScanNumber = 0,
     to: Format = "npz",
+    sensor: InputSensor = None,
+    **reading: Any,
 ) -> None:
     """Sets an object of a bank into one scan, with its box and with occlusion.
 
@@ -110,10 +124,11 @@ def insert_object(
     def change(given: "Scan") -> "Scan":
         return insert(given, bank[number], _pose(at))
 
-    _print_last(out, _edit(context, source, out, scan, to, change))
+    _print_last(out, _edit(context, change))
 
 
 @edit.command("move")
+@options_from(Reading, after="sensor")
 def move_object(
     context: typer.Context,
     source: Source,
@@ -124,6 +139,8 @@ def move_object(
     model: Model = None,
     seed: Seed = 0,
     to: Format = "npz",
+    sensor: InputSensor = None,
+    **reading: Any,
 ) -> None:
     """Moves an object of one scan to another place, and fills the hole that it leaves.
 
@@ -136,7 +153,7 @@ def move_object(
     def change(given: "Scan") -> "Scan":
         return move(given, box, _pose(at), model=model, seed=seed)
 
-    _print_last(out, _edit(context, source, out, scan, to, change))
+    _print_last(out, _edit(context, change))
 
 
 def _print_last(out: Path, edited: Any) -> None:
@@ -149,19 +166,15 @@ def _print_last(out: Path, edited: Any) -> None:
     )
 
 
-def _edit(
-    context: typer.Context,
-    source: str,
-    out: Path,
-    number: int | None,
-    to: str,
-    change: Callable[["Scan"], Any],
-    names: list[str] | None = None,
-) -> Any:
+def _edit(context: typer.Context, change: Callable[["Scan"], Any]) -> Any:
     """Write one scan of a source, or all, as they are after a change; the last one.
 
     Several edits of single scans may share a folder, each of another scan: beside it stands the
     call that wrote it, which may be run again.
+
+    Args:
+        context: of the command, with its options.
+        change: makes the edited scan.
     """
     from tqdm import tqdm
 
@@ -170,32 +183,51 @@ def _edit(
     from lidar_synth.formats import WRITERS, open_scans
     from lidar_synth.formats.convert import Report
 
-    writer = choose("--to", to, WRITERS)(out)
-    scans = open_scans(source)
-    chosen = range(len(scans))
-    if number is not None:
-        if number not in chosen:
-            raise ConfigError(f"--scan {number} of {len(scans)}", f"0 to {chosen[-1]}")
-        chosen = range(number, number + 1)
-    if names and not any(_named(scans[index], names) for index in chosen):
-        raise ConfigError(
-            f"--name {', '.join(names)}",
-            "the class of some box in these scans, such as KITTI's or the town's",
-        )
-    call = f"{context.info_name} {context.params | {'out': None}}"
-    of_all = call if number is None else None
-    with writer.hold(".edit.json", {"format": to, "edit": of_all}, scans):
-        report = Report(len(chosen), left_out=writer.carry(scans))
+    given = context.params
+    number = given["scan"]
+    writer = choose("--to", given["to"], WRITERS)(given["out"])
+    reading = {key: given[key] for key in ("sensor", *Reading.model_fields)}
+    scans = open_scans(given["source"], **drop_missing(reading))
+    chosen = range(len(scans)) if number is None else [number]
+    read = scans.load_or_skip if number is None else scans.load
+    if chosen[-1] >= len(scans):
+        raise ConfigError(f"--scan {number} of {len(scans)}", f"0 to {len(scans) - 1}")
+    if names := given.get("name"):
+        _require(names, filter(None, map(read, chosen)))
+    call = {"edit": context.info_name, **given, "out": None}
+    of_all = call if number is None else dict.fromkeys(call)
+    edited: Any = None
+    with writer.hold(".edit.json", of_all | {"to": given["to"]}, scans):
+        left_out = writer.carry(scans)
+        report = Report(0, 0, scans.skipped, scans.dropped, left_out)
         for index in tqdm(chosen, "scans", unit="scan", disable=len(chosen) < 8):
-            edited = change(scans[index])
+            if (scan := read(index)) is None:
+                continue
+            edited = change(scan)
             if number is not None:
-                claim(writer.root / f".edit-{index}.json", {"edit": call})
+                claim(writer.root / f".edit-{index}.json", call)
             camera = scans.calibration(index)
             writer.write(edited, index, name=scans.ids[index], calibration=camera)
+            report.written += 1
             report.lost.update(writer.loses(edited, camera))
         writer.finish()
-    print_report(report, out, to)
+    print_report(report, given["out"], given["to"])
     return edited
+
+
+def _require(names: list[str], scans: Iterable["Scan"]) -> None:
+    """Refuse names of classes of which no scan has a box."""
+    from lidar_synth.errors import ConfigError
+
+    there: set[str] = set()
+    for scan in scans:
+        there.update(scan.boxes.names if scan.boxes else ())
+        if there.intersection(names):
+            return
+    raise ConfigError(
+        f"--name {', '.join(names)}",
+        f"the class of some box in these scans: {', '.join(sorted(there)) or 'none'}",
+    )
 
 
 def _named(scan: "Scan", names: list[str]) -> list[int]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidar_synth.cli.convert import InputSensor
 from lidar_synth.cli.options import Reading, drop_missing, local_path, options_from
 from lidar_synth.errors import ConfigError
 
@@ -31,10 +32,7 @@ def view(
             parser=local_path,
         ),
     ] = None,
-    sensor: Annotated[
-        str | None,
-        typer.Option(help="sensor: a preset or a YAML file [named by the files]"),
-    ] = None,
+    sensor: InputSensor = None,
     **reading: Any,
 ) -> None:
     """Shows scans as range image, bird's-eye view and 3-D points.

@@ -219,7 +219,7 @@ def read_arrays(
         DataError: if it is not such a file, is damaged, declares more than it holds or than
             ``most``, or holds anything but numbers and text.
     """
-    content = read_file(path)
+    content = read_file(path, "an .npz or .npy file")
     if not content.startswith(b"PK"):
         return {"array": parse_npy(content, str(path))}
     members = _unzip(content, str(path), only, most)
