@@ -47,6 +47,11 @@ def test_scans_in_parts_are_scans_at_once() -> None:
     assert metric.compute() == metric.compute()
 
 
+def test_one_scan_is_no_list_of_scans() -> None:
+    with pytest.raises(DataError, match="scan .*; expected a list of scans"):
+        Metric("town").update(REAL[0], real=True)  # type: ignore[arg-type]
+
+
 def test_reset_forgets_the_generated_scans_and_real_ones_on_request() -> None:
     metric = Metric("town")
     metric.update(REAL, real=True)
