@@ -25,7 +25,8 @@ class Camera:
     Args:
         eye: position of the camera.
         target: the point at the centre of the picture.
-        up: the direction that is up in the picture.
+        up: the direction that is up in the picture; for a camera that looks along it, another one,
+            by default straight ahead.
         field: vertical field of view in degrees; with ``parallel``, the height of the picture in
             metres.
         parallel: orthographic projection instead of perspective.
@@ -42,6 +43,8 @@ class Camera:
         forward = np.subtract(self.target, self.eye).astype(np.float64)
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, self.up)
+        if not right.any():
+            right = np.cross(forward, np.roll(self.up, 1))
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(forward, right), forward])
 
