@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from roundtrips import back, same
 from test_write_then_read import complete
 from typer.testing import CliRunner
 
+from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.formats.convert import convert
@@ -120,6 +122,43 @@ def test_boxes_in_which_the_other_sensor_sees_nothing_are_left_out(
         and found.names == ("Car",)
         and np.allclose(found.values[0], near)
     )
+
+
+@pytest.mark.parametrize(
+    ("to", "change", "lost"),
+    [
+        ("range", {"points": 2}, "points without a cell of their own"),
+        ("png", {"points": 2}, "points without a cell of their own"),
+        ("kitti360", {"names": ("Pkw",)}, "names of boxes"),
+        ("kitti360", {"label": "motorcyclist"}, "classes of points"),
+    ],
+)
+def test_what_a_format_changes_is_counted_and_refused_on_request(
+    to: str, change: dict[str, Any], lost: str, tmp_path: Path
+) -> None:
+    fine = cast([car(12, 0)])
+    fine.label = np.full(len(fine), TRAIN_ID["road"], np.uint8)
+    spoilt = fine
+    if "points" in change:
+        spoilt = fine[np.repeat(np.arange(len(fine)), change["points"])]
+    if "names" in change:
+        spoilt = replace(fine, boxes=replace(fine.boxes, names=change["names"]))
+    if "label" in change:
+        label = np.full(len(fine), TRAIN_ID[change["label"]], np.uint8)
+        spoilt = replace(fine, label=label)
+    report = convert([fine, spoilt], WRITERS[to](tmp_path / "out"), progress=False)
+    assert report.lost[lost] == 1
+    with pytest.raises(ConfigError, match=f"has .*{lost}"):
+        convert([spoilt], WRITERS[to](tmp_path / "s"), strict=True, progress=False)
+
+
+@pytest.mark.parametrize("name", ["traffic cone", "DontCare"])
+def test_a_box_that_kitti_cannot_name_leaves_no_file(name: str, tmp_path: Path) -> None:
+    scan = cast([car(12, 0)])
+    scan = replace(scan, boxes=replace(scan.boxes, names=(name,)))
+    with pytest.raises(DataError, match=f"boxes called .'{name}'.*names of one word"):
+        WRITERS["kitti_object"](tmp_path).write(scan, 0)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_boxes_outside_the_camera_are_counted_and_refused_on_request(

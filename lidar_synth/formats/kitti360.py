@@ -45,6 +45,7 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import NAME
 from lidar_synth.formats.kitti360_boxes import (
     MOST_INSTANCE,
+    OBJECTS,
     WorldBoxes,
     read_boxes,
     write_boxes,
@@ -272,6 +273,17 @@ class KITTI360Writer(Writer):
                 labels_folder(self.root, drive) / f"{frame}.label", label_values(scan)
             )
         self._write_points(path, scan)
+
+    def loses(self, scan: Scan, camera: Calibration | None) -> list[str]:
+        lost = super().loses(scan, camera)
+        known = {name for *_, name in OBJECTS.values()}
+        if scan.boxes and set(scan.boxes.names) - known:
+            lost.append("names of boxes")
+        if scan.label is not None:
+            kept = decode_labels(label_values(scan), CLASSES, scan.id)["label"]
+            if (kept != scan.label).any():
+                lost.append("classes of points")
+        return lost
 
     def finish(self) -> None:
         for folder in sorted((self.root / "data_poses").glob("*")):

@@ -150,6 +150,12 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     )
     lines = []
     listed = np.flatnonzero((image_box >= 0).all(axis=1))
+    names = [boxes.names[i] for i in listed]
+    if any(name.split() != [name] or name == "DontCare" for name in names):
+        raise DataError(
+            f"{path}: boxes called {sorted(set(names))}",
+            "names of one word, such as Person_sitting",
+        )
     for i in listed:
         occlusion = boxes.occlusion[i] if boxes.occlusion[i] >= 0 else 3
         row = (alpha[i], *image_box[i], *size[i], *floor[i], rotation_y[i])
@@ -161,12 +167,7 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
             f"DontCare -1 -1 -10 {' '.join(map(_two, rectangle))} -1 -1 -1 -1000 -1000 -1000 -10"
         )
     text = "".join(line + "\n" for line in lines)
-    names = tuple(boxes.names[i] for i in listed)
-    if decode_label_2(text, path, camera).names != names:
-        raise DataError(
-            f"{path}: boxes called {sorted(set(names))}",
-            "names of one word, such as Person_sitting",
-        )
+    decode_label_2(text, path, camera)
     write_file(path, text.encode())
 
 

@@ -254,13 +254,17 @@ class KITTIObjectWriter(Writer):
         if picture is None:
             width, height = assumed_size(camera)
             picture = np.zeros((height, width, 3), np.uint8)
-        image = folder / "image_2" / f"{frame}.png"
-        write_image(image, picture)
-        write_calibration(folder / "calib" / f"{frame}.txt", camera)
         if camera.image_size is None:  # on which depends which boxes are in view
-            camera = replace(camera, image_size=picture_size(image))
+            size = (
+                picture_size(picture)
+                if isinstance(picture, Path)
+                else picture.shape[1::-1]
+            )
+            camera = replace(camera, image_size=size)
         if folder.name == "training" and scan.boxes is not None:
             write_label_2(folder / "label_2" / f"{frame}.txt", scan.boxes, camera)
+        write_image(folder / "image_2" / f"{frame}.png", picture)
+        write_calibration(folder / "calib" / f"{frame}.txt", camera)
         self._write_points(path, scan)
 
     def loses(self, scan: Scan, camera: Calibration | None) -> list[str]:

@@ -29,7 +29,7 @@ from lidar_synth.formats.description import check_provenance
 from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import FileWriter, project_scan
+from lidar_synth.formats.writer import GridWriter, project_scan
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -161,7 +161,7 @@ def _steps(path: Path, values: NDArray[Any] | None = None) -> NDArray[Any]:
     return values
 
 
-class PNGWriter(FileWriter):
+class PNGWriter(GridWriter):
     """Writes the scan, projected onto its sensor's grid, as ``range``, ``reflectance`` and
     ``label`` PNG files."""
 

@@ -32,7 +32,7 @@ from lidar_synth.formats.npz import (
 from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import DETAILS, FileWriter, project_scan
+from lidar_synth.formats.writer import DETAILS, GridWriter, project_scan
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -229,7 +229,7 @@ def decode_stack(
     return range_image(distance, sensor, channels, where), {}, points
 
 
-class RangeWriter(FileWriter):
+class RangeWriter(GridWriter):
     """Writes the package's own ``NAME.npz``: the scan projected onto its sensor's grid, with all
     its fields."""
 

@@ -241,6 +241,16 @@ class FileWriter(Writer):
         """Write a scan."""
 
 
+class GridWriter(FileWriter):
+    """A writer of scans on their sensor's grid, which holds one point for each ray."""
+
+    def loses(self, scan: Scan, camera: Calibration | None) -> list[str]:
+        lost = super().loses(scan, camera)
+        if project_scan(scan).mask.sum() < len(scan):
+            lost.append("points without a cell of their own")
+        return lost
+
+
 def check_facts(scan: Scan, where: str) -> None:
     """Refuse a domain, provenance or pose that readers refuse.
 
