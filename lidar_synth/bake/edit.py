@@ -132,8 +132,9 @@ def drop(
             f"all {len(bank)} scans of {bank.root} left out ({why})",
             "a rule that leaves some",
         )
-    left = hash_of_names(map(str, sorted(left_out)))
-    with _making(out, "drop", [bank], why, left) as complete:
+    with _making(
+        out, "drop", [bank], hash_of_names(map(str, sorted(left_out))), why
+    ) as complete:
         if complete:
             return Bank(out).index
         return _link_kept(bank, left_out, why, out, progress)

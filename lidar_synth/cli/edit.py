@@ -198,8 +198,7 @@ def _edit(context: typer.Context, change: Callable[["Scan"], Any]) -> Any:
     of_all = call if number is None else dict.fromkeys(call)
     edited: Any = None
     with writer.hold(".edit.json", of_all | {"to": given["to"]}, scans):
-        left_out = writer.carry(scans)
-        report = Report(0, 0, scans.skipped, scans.dropped, left_out)
+        report = Report(0, 0, scans.skipped, scans.dropped, writer.carry(scans))
         for index in tqdm(chosen, "scans", unit="scan", disable=len(chosen) < 8):
             if (scan := read(index)) is None:
                 continue
