@@ -204,8 +204,9 @@ class Metric:
             real: whether they are real ones.
 
         Raises:
-            DataError: on one scan that is no list, a scan without returns in the protocol's area, scans of sensors that
-                differ, scans some of which have labels, and features that are not finite.
+            DataError: on one scan that is no list, a scan without returns in the protocol's area,
+                scans of sensors that differ, scans some of which have labels, and features that are
+                not finite.
         """
         if isinstance(scans, Scan):
             raise DataError(f"scan {scans.id!r}", "a list of scans")
