@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import PANDASET
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import DataError, choose
 from lidar_synth.files.disk import list_files, name_errors
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.pandas_table import read_table, require_numbers
@@ -115,10 +115,7 @@ class PandaSet(ScanFiles):
         camera: str = CAMERAS[0],
         on_bad: OnBad = "error",
     ) -> None:
-        if camera not in CAMERAS:
-            raise ConfigError(
-                f"camera {camera!r} of PandaSet", f"one of {', '.join(CAMERAS)}"
-            )
+        choose("PandaSet's camera", camera, dict.fromkeys(CAMERAS))
         root = Path(root)
         if sequences is None and any(root.glob(FRAMES)):
             root, sequences = root.resolve().parent, (root.resolve().name,)

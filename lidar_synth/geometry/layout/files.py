@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.geometry.layout.layout import Layout, Outline
 from lidar_synth.geometry.scan import Boxes, wrap_angle
@@ -116,11 +116,8 @@ def load_layout(path: str | Path) -> Layout:
 
 def _box(given: _Object, ground: float, path: Path) -> tuple[float, ...]:
     """(7,) the box of an object."""
-    if given.kind not in SIZES:
-        raise ConfigError(
-            f"{path}: an object of class {given.kind!r}", f"one of {', '.join(SIZES)}"
-        )
-    length, width, height = given.size or SIZES[given.kind]
+    usual = choose(f"{path}: an object of class", given.kind, SIZES)
+    length, width, height = given.size or usual
     yaw = wrap_angle(np.radians(given.heading))
     return (
         *given.at,
