@@ -14,7 +14,7 @@ from PIL import Image
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.datasets.colours import COLOURS
-from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -111,7 +111,7 @@ def test_lightness_is_monotonic_along_a_colour_table(name: str) -> None:
 
 def test_a_missing_or_unknown_channel_is_refused() -> None:
     image = project(replace(random_scan(SMALL), label=None))
-    with pytest.raises(ConfigError, match="'label'.*one of range, reflectance"):
+    with pytest.raises(ConfigError, match="'label'.*one of 'range', 'reflectance'"):
         picture(image, "label")
     with pytest.raises(ConfigError, match="'depth'"):
         picture(image, "depth")
@@ -344,6 +344,15 @@ def test_a_contact_sheet_shows_every_scan() -> None:
         contact_sheet([])
 
 
+def test_a_camera_straight_above_shows_ahead_up() -> None:
+    scan = random_scan(SMALL)
+    above = Camera((0.0, 0.0, 50.0))
+    ahead = replace(above, up=(1.0, 0.0, 0.0))
+    assert np.array_equal(above.axes(), ahead.axes())
+    assert np.isfinite(Camera((9.0, 0, 0), up=(1.0, 0, 0)).axes()).all()
+    assert render(scan, camera=above, size=(64, 36)).max() > 100
+
+
 @pytest.mark.slow
 def test_pictures_and_pages_are_written_to_files(tmp_path: Path) -> None:
     scans = [random_scan(SMALL, seed=i) for i in range(2)]
@@ -357,6 +366,20 @@ def test_pictures_and_pages_are_written_to_files(tmp_path: Path) -> None:
     ]
     assert Image.open(tmp_path / "one.png").size[0] == 1700
     assert "<title>Two</title>" in (tmp_path / "two.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("scale", [255, np.nan])
+@pytest.mark.parametrize("field", ["points", "reflectance"])
+@pytest.mark.parametrize("suffix", ["png", "html"])
+def test_values_that_are_none_are_refused(
+    suffix: str, field: str, scale: float, tmp_path: Path
+) -> None:
+    scan = random_scan(SMALL)
+    if field == "points" and scale == 255:
+        scale = np.inf
+    wrong = replace(scan, **{field: getattr(scan, field) * np.float32(scale)})
+    with pytest.raises(DataError, match=f"{field} (that are NaN|up to).*expected"):
+        write_view(tmp_path / f"out.{suffix}", [scan, wrong])
 
 
 def test_invalid_paths_and_empty_lists_are_refused(tmp_path: Path) -> None:

@@ -447,10 +447,11 @@ def identity_of(source: Any) -> str:
 
 
 def require_finite(scan: Scan) -> None:
-    """Check the points of a scan.
+    """Check the points of a scan, and that their reflectance is no intensity on another scale;
+    values just above 1 pass.
 
     Raises:
-        DataError: if some are NaN or infinite.
+        DataError: if some are NaN or infinite, or have another reflectance than 0 to 1.
     """
     if not np.isfinite(scan.points).all():
         raise DataError(
@@ -458,6 +459,12 @@ def require_finite(scan: Scan) -> None:
             "finite points",
             "Drop them: scan[np.isfinite(scan.points).all(1)], or on_bad='drop-points' where "
             "scans are read.",
+        )
+    if not np.abs(scan.reflectance).max(initial=0) < 1.1:
+        raise DataError(
+            f"scan {scan.id!r} with a reflectance up to {scan.reflectance.max():g}",
+            "0 to 1",
+            "Divide it by its maximum: reflectance_max=255 where scans are read.",
         )
 
 

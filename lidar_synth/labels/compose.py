@@ -18,18 +18,17 @@ from inspect import signature
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import Self
 
 from lidar_synth.errors import ConfigError, choose
-from lidar_synth.geometry.scan import Boxes, Scan, Source
+from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.labels import augment
 from lidar_synth.labels.augment import Augmentation
 from lidar_synth.labels.own import check_share
 from lidar_synth.labels.policies import read_policy
 from lidar_synth.weather import CORRUPTIONS, Corruption
-from lidar_synth.weather.corruption import SURFACE
+from lidar_synth.weather.corruption import lost_boxes
 
 MOVES: dict[str, Callable[..., Scan]] = {
     "yaw": augment.yaw,
@@ -80,8 +79,7 @@ class Step:
             return changed.noted(self.name, **self.arguments)
         boxes = changed.boxes
         if isinstance(call, Corruption) and boxes is not None:
-            lost = _have_returns(boxes, scan) & ~_have_returns(boxes, changed)
-            return replace(changed, boxes=boxes[~lost])
+            return replace(changed, boxes=boxes[~lost_boxes(boxes, scan, changed)])
         return changed
 
     def bind(self, real: Source | None, fields: frozenset[str]) -> "Step":
@@ -247,12 +245,6 @@ def read_step(given: Any) -> Step:
         "a function, a name, or {name: {argument: value}} such as "
         "{fog: {visibility: 60, p: 0.5}}",
     )
-
-
-def _have_returns(boxes: Boxes, scan: Scan) -> NDArray[np.bool_]:
-    """(M,) whether boxes hold a return that a surface caused."""
-    surface = slice(None) if scan.cause is None else scan.cause == SURFACE
-    return np.asarray(boxes.contain(scan.points[surface]).any(1))
 
 
 def _check_choice(key: str, values: Sequence[Any]) -> Sequence[Any]:

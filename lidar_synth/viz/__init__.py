@@ -68,6 +68,7 @@ def write_view(
 
     Raises:
         ConfigError: on another suffix, or without scans.
+        DataError: on points that are NaN or infinite, or another reflectance than 0 to 1.
         FileError: if the file cannot be written.
 
     Example:
@@ -78,8 +79,6 @@ def write_view(
         '<!doctype html>'
     """
     path = Path(path)
-    if not given:
-        raise ConfigError(f"no scans to write to {path}", "at least one scan")
     if view_suffix(path) == ".html":
         write_file(path, html_page(given, title=title, notes=notes).encode())
         return

@@ -1,15 +1,15 @@
 """Range images as pictures with one pixel per cell; cells without a return are dark."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.scan import RangeImage, Scan, require_finite
 from lidar_synth.viz.scales import EMPTY, Rgb, Scale, make_scales
 
 CHANNELS = ("range", "reflectance", "label")
@@ -25,9 +25,7 @@ class View(NamedTuple):
     @property
     def channels(self) -> tuple[str, ...]:
         """The members of ``CHANNELS`` that the range image has."""
-        return tuple(
-            name for name in CHANNELS if name == "range" or name in self.image.channels
-        )
+        return tuple(_shown(self.image))
 
     @property
     def classes(self) -> NDArray[np.int64]:
@@ -41,13 +39,29 @@ class View(NamedTuple):
 
 
 def views(given: Sequence[Scan | RangeImage]) -> list[View]:
-    """Project scans to range images (spherical projection), and unproject range images to scans."""
+    """Project scans to range images (spherical projection), and unproject range images to scans.
+
+    Raises:
+        ConfigError: without scans.
+        DataError: on points that are NaN or infinite, or another reflectance than 0 to 1.
+    """
+    if not given:
+        raise ConfigError("no scans to show", "at least one scan")
+    for item in given:
+        if isinstance(item, Scan):
+            require_finite(item)
     return [
         View(item, project(item, channels=[n for n in CHANNELS if n in item.fields()]))
         if isinstance(item, Scan)
         else View(unproject(item), item)
         for item in given
     ]
+
+
+def _shown(image: RangeImage) -> dict[str, NDArray[Any]]:
+    """The channels that are shown."""
+    has = {"range": image.range, **image.channels}
+    return {name: has[name] for name in CHANNELS if name in has}
 
 
 def picture(
@@ -63,9 +77,6 @@ def picture(
     Raises:
         ConfigError: on a channel that the image does not have.
     """
-    available = ("range", *(name for name in CHANNELS if name in image.channels))
-    if channel not in available:
-        raise ConfigError(f"a picture of {channel!r}", f"one of {', '.join(available)}")
-    values = image.range if channel == "range" else image.channels[channel]
+    values = choose("picture of", channel, _shown(image))
     colours = (scale or make_scales([unproject(image)])[channel])(values)
     return np.where(image.mask[..., None], colours, EMPTY)

@@ -23,7 +23,6 @@ from PIL import Image
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
-from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import read_picture
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.viz.images import View, picture, views
@@ -84,10 +83,8 @@ def html_page(
         panels: HTML below the viewer, inserted as it is.
 
     Raises:
-        ConfigError: without scans.
+        ConfigError, DataError: as ``images.views``.
     """
-    if not given:
-        raise ConfigError("no scans for a page", "at least one scan")
     all_views = views(given)
     colours = make_scales([view.scan for view in all_views])
     content = {

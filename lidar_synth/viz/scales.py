@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lidar_synth.datasets.colours import COLOURS
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.geometry.scan import Scan
 
 Rgb = NDArray[np.uint8]
@@ -133,9 +133,7 @@ def point_values(scan: Scan, by: str) -> NDArray[Any]:
     Raises:
         ConfigError: on an unknown quantity, or one that the scan does not have.
     """
-    if by not in VALUES:
-        raise ConfigError(f"colour by {by!r}", f"one of {', '.join(VALUES)}")
-    values = VALUES[by](scan)
+    values = choose("colour by", by, VALUES)(scan)
     if values is None:
         raise ConfigError(
             f"scan {scan.id!r} has no {by}", f"one of {', '.join(available(scan))}"

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import NAMES
-from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Camera, bird, render
@@ -98,9 +97,8 @@ def contact_sheet(
 
     Raises:
         ConfigError: without scans, or if a scan does not have the quantity.
+        DataError: as ``images.views``.
     """
-    if not given:
-        raise ConfigError("no scans for a sheet", "at least one scan")
     all_views = views(given)
     colours = make_scales([view.scan for view in all_views])
     by = by or (

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError, suggest
+from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.scan import CAUSES, Boxes, Scan, require_finite
 
@@ -71,13 +71,8 @@ class Corruption(ABC):
         Raises:
             ConfigError: on a name that is not in ``SEVERITIES``.
         """
-        if severity not in SEVERITIES:
-            raise ConfigError(
-                f"severity {severity!r}",
-                f"one of {', '.join(SEVERITIES)}",
-                suggest(severity, SEVERITIES),
-            )
-        return cls(**cls.SEVERE[SEVERITIES.index(severity)], **options)
+        known = dict(zip(SEVERITIES, cls.SEVERE, strict=True))
+        return cls(**choose("severity", severity, known), **options)
 
     @abstractmethod
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
@@ -91,7 +86,8 @@ class Corruption(ABC):
         """The corrupted scan; the given one is not changed.
 
         Raises:
-            DataError: on points that are NaN or infinite, or as ``change``.
+            DataError: on points that are NaN or infinite, another reflectance than 0 to 1, or as
+            ``change``.
         """
         require_finite(scan)
         settings = {f.name: getattr(self, f.name) for f in fields(self)[1:]}
@@ -108,11 +104,14 @@ class Corruption(ABC):
             given = getattr(new, name)
             if given is not None:
                 changed[name] = np.where(lost, given.dtype.type(value), given)
-        if scan.boxes is not None:
-            changed["boxes"] = _flagged(scan.boxes, scan, change)
-        return replace(
+        result = replace(
             new, points=change.points, reflectance=change.reflectance, **changed
         )
+        if scan.boxes is not None:
+            occlusion = scan.boxes.occlusion.copy()
+            occlusion[lost_boxes(scan.boxes, scan, result)] = OUT_OF_SIGHT
+            result.boxes = replace(scan.boxes, occlusion=occlusion)
+        return result
 
 
 def keep_points(scan: Scan, keep: NDArray[np.bool_]) -> Change:
@@ -150,14 +149,10 @@ def require_between(name: str, value: float, low: float, high: float) -> None:
         raise ConfigError(f"{name}={value}", f"{low:g} to {high:g}")
 
 
-def _flagged(boxes: Boxes, scan: Scan, change: Change) -> Boxes:
-    """The boxes, with those that have lost all their returns flagged. What was no surface
-    before is no return of theirs."""
-    inside = boxes.contain(scan.points)
-    if scan.cause is not None:
-        inside &= scan.cause == SURFACE
-    left = np.zeros(len(scan), bool)
-    left[change.source[change.cause == SURFACE]] = True
-    gone = inside.any(1) & ~(inside & left).any(1)
-    occlusion = np.where(gone, OUT_OF_SIGHT, boxes.occlusion).astype(np.int8)
-    return replace(boxes, occlusion=occlusion)
+def lost_boxes(boxes: Boxes, before: Scan, after: Scan) -> NDArray[np.bool_]:
+    """(M,) whether boxes held returns of surfaces before a change, and hold none after it."""
+    held, left = (
+        boxes.contain(s.points if s.cause is None else s.points[s.cause == SURFACE])
+        for s in (before, after)
+    )
+    return np.asarray(held.any(1) & ~left.any(1))
