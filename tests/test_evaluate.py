@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from banks import some_image, write_bank
@@ -136,6 +137,20 @@ def test_the_figures_stand_beside_the_published_ones(
     for more in (["--json"], ["--judge", "squeezeseg"]):
         refused = CliRunner().invoke(app, [*call, *more])
         assert refused.exit_code == 2 and "--beside" in refused.stderr
+
+
+def test_the_options_of_reading_are_of_the_real_scans(tmp_path: Path) -> None:
+    scan = random_scan(presets()["town"], 1500)
+    bright = np.column_stack([scan.points, scan.reflectance * 255]).astype(np.float32)
+    for name in ("real", "fake"):
+        (tmp_path / name).mkdir()
+        bright.tofile(tmp_path / name / "0.bin")
+    call = ["evaluate", *(str(tmp_path / n) for n in ("real", "fake")), "--protocol"]
+    result = CliRunner().invoke(
+        app, [*call, "town", "--sensor", "town", "--reflectance-max", "255"]
+    )
+    message = r"^FAKE \(.*0\.bin.*options.* of REAL\. lidar-synth convert .*fake"
+    assert re.search(message, str(result.exception))
 
 
 def test_a_measure_without_a_place_in_a_table_is_left_out_by_its_title(

@@ -125,7 +125,7 @@ def evaluate(
       lidar-synth evaluate SemanticKITTI town --objects
       lidar-synth evaluate KITTI town --detector pointpillar_7728.pth
     """
-    from lidar_synth.errors import choose
+    from lidar_synth.errors import DataError, choose
     from lidar_synth.formats import open_scans
     from lidar_synth.lab.evaluate import PROTOCOLS
     from lidar_synth.lab.evaluate import evaluate as compare
@@ -168,6 +168,14 @@ def evaluate(
         open_scans(real, sensor=sensor, **drop_missing(reading)),
         open_scans(fake, sensor=sensor),
     )
+    try:
+        sources[1].load(0)
+    except DataError as error:
+        raise DataError(
+            f"FAKE ({error})",
+            "scans that need no options of reading: those given are of REAL",
+            f"lidar-synth convert {fake} OUT --to npz takes them, too.",
+        ) from error
     if not training_data and (note := refuse_training_data(*sources, reading["split"])):
         typer.echo(note, err=True)
     if judge is not None:
