@@ -216,9 +216,8 @@ def test_distance_maps_are_exact(side: int) -> None:
 
 @pytest.mark.parametrize(("protocol", "cell"), [("lidm", 0.5), ("r3dpa", 0.05)])
 def test_minimum_matching_distance_by_nearest_neighbours(
-    protocol: str, cell: float, monkeypatch: pytest.MonkeyPatch
+    protocol: str, cell: float
 ) -> None:
-    monkeypatch.setattr(lidm, "_BLOCK", 2)
     real, fake = ([s.points for s in scans(n, seed)] for n, seed in ((5, 1), (3, 2)))
     side = lidm.cells_along(cell)
     grids = [

@@ -39,9 +39,7 @@ def count_isolated(scan: Scan) -> NDArray[np.int64]:
 
 def share_of_isolated(counts: NDArray[np.int64]) -> NDArray[np.float64]:
     """The share of isolated returns of counts (2, ...), NaN where there is no return."""
-    with np.errstate(invalid="ignore"):
-        shares: NDArray[np.float64] = np.divide(counts[0], counts[1])
-    return shares
+    return np.asarray(counts[0] / np.where(counts[1] > 0, counts[1], np.nan))
 
 
 def isolated_ratio(

@@ -27,10 +27,6 @@ SENSOR = Sensor(
 )
 """The grid of LiDM's range images."""
 
-_BLOCK = 128  # clouds compared with one another at a time: 20 MB of 200 x 200 maps
-# cells of a grid up to which the maps of a block are held and multiplied
-_MOST_CELLS = 1 << 16
-
 
 def find_occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:
     """The cells of ``size`` metres that hold a point, as row * cells per side + column, sorted: row
@@ -71,53 +67,20 @@ def matching_distances(
 
     The Chamfer distance of two clouds is the mean of both mean squared distances between nearest
     occupied cells, in units of the side of the square. All clouds share one grid, so that the
-    squared distance from every cell to a cloud is one map. On a coarse grid all pairs are one
-    matrix product; on a fine one the maps are made one after another.
+    squared distance from every cell to a cloud is one map.
 
     Args:
         real, generated: occupied cells of each cloud.
         size: of a cell, metres.
     """
     side = cells_along(size)
-    both = (_by_product if side**2 <= _MOST_CELLS else _by_lookup)(
-        real, generated, side
-    )
-    return np.asarray(both / np.float32(2 * side**2), np.float32)
-
-
-def _by_product(
-    real: Sequence[NDArray[np.int32]], generated: Sequence[NDArray[np.int32]], side: int
-) -> NDArray[np.float32]:
-    total = np.empty((len(real), len(generated)), np.float32)
-    maps = np.concatenate(
-        [
-            _distance_maps(real[i : i + _BLOCK], side)
-            for i in range(0, len(real), _BLOCK)
-        ]
-    )
-    for j in range(0, len(generated), _BLOCK):
-        block = generated[j : j + _BLOCK]
-        to_generated = _distance_maps(block, side)
-        of_generated = _weights(block, side)
-        for i in range(0, len(real), _BLOCK):
-            pair = (
-                _weights(real[i : i + _BLOCK], side) @ to_generated.T
-                + maps[i : i + _BLOCK] @ of_generated.T
-            )
-            total[i : i + _BLOCK, j : j + _BLOCK] = pair
-    return total
-
-
-def _by_lookup(
-    real: Sequence[NDArray[np.int32]], generated: Sequence[NDArray[np.int32]], side: int
-) -> NDArray[np.float32]:
     total = np.zeros((len(real), len(generated)), np.float32)
     for maps, others, out in ((real, generated, total), (generated, real, total.T)):
         cells = np.concatenate(others)
         starts = np.concatenate([[0], np.cumsum([len(o) for o in others])])
         for cloud, row in zip(maps, out, strict=True):
             _add_means(_distance_map(cloud, side).ravel(), cells, starts, row)
-    return total
+    return np.asarray(total / np.float32(2 * side**2), np.float32)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -133,22 +96,6 @@ def _add_means(
         for i in range(starts[k], starts[k + 1]):
             total += values[cells[i]]
         out[k] += total / (starts[k + 1] - starts[k])
-
-
-def _weights(clouds: Sequence[NDArray[np.int32]], side: int) -> NDArray[np.float32]:
-    """(n, side * side) the share of each cell in the mean over a cloud."""
-    weights = np.zeros((len(clouds), side**2), np.float32)
-    for row, cells in zip(weights, clouds, strict=True):
-        row[cells] = 1 / len(cells)
-    return weights
-
-
-def _distance_maps(
-    clouds: Sequence[NDArray[np.int32]], side: int
-) -> NDArray[np.float32]:
-    """(n, side * side) squared distance, in cells, from every cell to the nearest that a cloud
-    occupies."""
-    return np.stack([_distance_map(cells, side).ravel() for cells in clouds])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -216,9 +216,8 @@ def corrupt(scans: Source, case: str, seed: int = 0) -> Iterator[Scan]:
 def show_cases(scan: Scan, corruptions: Sequence[str], seed: int = 0) -> list[Scan]:
     """A labelled scan in every case, named by it."""
     return [
-        replace(one, id=case)
+        replace(next(corrupt([scan], case, seed)), id=case)
         for case in cases(corruptions)
-        for one in corrupt([scan], case, seed)
     ]
 
 
@@ -278,10 +277,7 @@ def count_points(scan: Scan, predicted: Any) -> Table:
 
 def sum_tables(tables: Iterable[Table]) -> Table:
     """The sum of the tables of several scans."""
-    total = np.zeros((len(NAMES), len(NAMES) + 1), np.int64)
-    for table in tables:
-        total += table
-    return total
+    return sum(tables, np.zeros((len(NAMES), len(NAMES) + 1), np.int64))
 
 
 def _compare_files(folder: Path, scans: Iterable[Scan], case: str) -> Table:
