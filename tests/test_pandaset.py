@@ -242,7 +242,7 @@ def test_sequences_and_cameras_are_chosen(tmp_path: Path) -> None:
     ):
         PandaSet(tmp_path, sequences=("020",))
     with pytest.raises(
-        ConfigError, match="camera 'front'.*front_camera, front_left_camera"
+        ConfigError, match="camera 'front'.*'front_camera', 'front_left_camera'"
     ):
         PandaSet(tmp_path, camera="front")
     back = PandaSet(tmp_path, camera=CAMERAS[-1])
