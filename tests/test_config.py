@@ -39,6 +39,7 @@ def test_every_file_is_a_recipe_a_base_or_a_sensor() -> None:
         for base in np.atleast_1d(yaml.safe_load(p.read_text()).get("base", []))
     }
     assert named == {p.stem for p in (CONFIGS / "base").iterdir()}
+    assert not named & set(RECIPES)  # `base: NAME` in a user's file is the recipe
 
 
 @pytest.mark.parametrize(
