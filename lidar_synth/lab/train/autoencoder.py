@@ -140,7 +140,6 @@ def autoencoder_loss(network: nn.Module, example: Example, metric: Metric) -> Te
 class AutoencoderStage(Stage):
     """The training of an autoencoder; raises as ``open_networks``."""
 
-    kind = "autoencoder"
     task: Task = staticmethod(reconstruction_task)
     loss = staticmethod(autoencoder_loss)
 

@@ -78,7 +78,6 @@ class DecoderStage(AutoencoderStage):
         ConfigError: on a model without such a decoder.
     """
 
-    kind = "decoder"
     loss = staticmethod(decoding_loss)
 
     def __init__(self, config: TrainConfig, device: torch.device | str) -> None:

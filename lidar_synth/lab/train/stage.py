@@ -62,7 +62,6 @@ class Stage:
         device: of the training.
 
     Attributes:
-        kind: what is trained, in one word.
         task: makes training examples of batches.
         loss: what is lowered.
 
@@ -70,7 +69,6 @@ class Stage:
         FileError, DataError: where the scans cannot be opened, or weights of CLIP are missing.
     """
 
-    kind: str
     task: Task
     loss: Loss = staticmethod(velocity_loss)
 
@@ -93,23 +91,6 @@ class Stage:
             find_clip(device)  # missing weights are noticed before scans are read
         known = recordings_known(config, header.provenance, header.sensor)
         self.add_facts(seen=known.to_list())
-
-    def __str__(self) -> str:
-        """The training in words."""
-        sensor = self.header.sensor
-        rows, columns = sensor.shape
-        trained = sum(p.numel() for p in self.network.parameters() if p.requires_grad)
-        recipe = self.config.recipe
-        data = self.config.data
-        scans = data.path if data.town is None else f"{data.town} scans of the town"
-        lines = [
-            f"{self.kind} -> {self.config.checkpoint}",
-            f"sensor {sensor.name}: {rows} x {columns} cells of "
-            f"{', '.join(self.header.channels)}",
-            f"{trained / 1e6:.2f} M trained parameters",
-            f"{recipe.iterations} steps of {recipe.batch} samples from {scans}",
-        ]
-        return "\n".join(lines)
 
     def add_facts(self, **facts: Any) -> None:
         """Add to the provenance in the header."""

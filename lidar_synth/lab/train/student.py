@@ -82,7 +82,6 @@ class StudentStage(Stage):
         ConfigError: where the configuration does not fit the teacher.
     """
 
-    kind = "student"
     config: DistillConfig
 
     def __init__(self, config: DistillConfig, device: torch.device | str) -> None:

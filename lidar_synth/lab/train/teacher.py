@@ -22,8 +22,6 @@ def teacher_task(timesteps: str = "uniform") -> Task:
 class TeacherStage(Stage):
     """The training of a rectified flow; raises as ``open_networks``."""
 
-    kind = "teacher"
-
     def __init__(self, config: TrainConfig, device: torch.device | str) -> None:
         networks, header = open_networks(config)
         # The maps of such scans have the gaps of their projection, which the model learns.
