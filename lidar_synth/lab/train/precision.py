@@ -6,6 +6,8 @@ from functools import cache
 import torch
 from torch import nn
 
+from lidar_synth.generate.devices import available_devices
+
 _SIDE = 512
 _ROUNDS = 3
 
@@ -17,12 +19,12 @@ def choose_precision(asked: str) -> str:
     Args:
         asked: "no" = float32, or "bf16".
     """
-    gpu = (
-        torch.cuda.is_available()
-        or torch.xpu.is_available()
-        or torch.backends.mps.is_available()
-    )
-    return asked if asked == "no" or gpu or faster_in_bfloat16() else "no"
+    return asked if asked == "no" or has_gpu() or faster_in_bfloat16() else "no"
+
+
+def has_gpu() -> bool:
+    """Whether torch can compute on a GPU."""
+    return len(available_devices()) > 1
 
 
 @cache

@@ -38,7 +38,7 @@ from lidar_synth.lab.train.held_out import Watch
 from lidar_synth.lab.train.interrupts import first_signal
 from lidar_synth.lab.train.loop import EVERY, Record, read_figures, steps
 from lidar_synth.lab.train.norms import share_norms
-from lidar_synth.lab.train.precision import choose_precision
+from lidar_synth.lab.train.precision import choose_precision, has_gpu
 from lidar_synth.lab.train.ranks import Ranks
 from lidar_synth.lab.train.resume import check_parents, check_resumed
 from lidar_synth.lab.train.stage import Stage
@@ -208,15 +208,9 @@ def _accelerator(config: Run) -> Iterator["Accelerator"]:
         )
     # Without cpu=True, Accelerate treats the processes of torchrun on a machine without GPU as
     # separate runs.
-    gpu = (
-        torch.cuda.is_available()
-        or torch.xpu.is_available()
-        or torch.backends.mps.is_available()
-    )
+    on_cpu = "LOCAL_RANK" in os.environ and not has_gpu()
     try:
-        yield Accelerator(
-            mixed_precision=precision, cpu="LOCAL_RANK" in os.environ and not gpu
-        )
+        yield Accelerator(mixed_precision=precision, cpu=on_cpu)
     finally:
         if not by_caller:
             AcceleratorState._reset_state()
