@@ -66,6 +66,7 @@ def fresh_networks(config: TrainConfig) -> Opened:
                 stacklevel=2,
             )
         fixed = {}
+        networks: dict[str, nn.Module] = {}
         state = (tensors.size, *sensor.shape)
     else:
         codec = _load_codec(config.codec)
@@ -74,7 +75,8 @@ def fresh_networks(config: TrainConfig) -> Opened:
         sensor = held.sensor
         tensors = held.tensors
         fixed = {CODEC: held.networks[CODEC]}
-        state = make_codec(codec.networks[CODEC], tensors, sensor.shape).shape
+        networks = {CODEC: codec.networks[CODEC]}
+        state = make_codec(networks[CODEC], tensors, sensor.shape).shape
         provenance |= {"codec": codec.hash, "codec_provenance": held.provenance}
     parts = config.parts(state, sensor.shape)
     header = Header(
@@ -86,7 +88,7 @@ def fresh_networks(config: TrainConfig) -> Opened:
         provenance=provenance,
         conditioning=_conditioning(config.condition),
     )
-    return _build(config, parts, sensor, state), header
+    return networks | _build(config, parts, sensor, state), header
 
 
 def limit_ranges(sensor: Sensor, normalisation: Normalisation) -> Sensor:

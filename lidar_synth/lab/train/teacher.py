@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from lidar_synth.generate.checkpoint import CODEC, join, load_checkpoint
+from lidar_synth.generate.checkpoint import CODEC, join
 from lidar_synth.generate.flow.path import TIMESTEPS, flow_matching
 from lidar_synth.lab.train.config import TrainConfig
 from lidar_synth.lab.train.stage import Stage, Task
@@ -30,8 +30,6 @@ class TeacherStage(Stage):
             header = replace(
                 header, conditioning=header.conditioning | {"semantic": options}
             )
-        if config.codec is not None and CODEC not in networks:
-            networks[CODEC] = load_checkpoint(config.codec).networks[CODEC]
         frozen = {name: part for name, part in networks.items() if name == CODEC}
         super().__init__(config, join(networks), header, frozen, device)
         self.task = teacher_task(config.timesteps)
