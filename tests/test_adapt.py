@@ -56,6 +56,7 @@ from lidar_synth.lab.train.adaptation.scans import Prepared
 from lidar_synth.lab.train.adaptation.stages import TOWN_SEED, Work, stages_for
 from lidar_synth.lab.train.config import DistillConfig
 from lidar_synth.lab.train.held_out import read_history
+from lidar_synth.lab.train.staged import StagedRuns
 
 TINY = load_sensor(Path(__file__).parent.parent / "configs" / "tiny_sensor.yaml")
 OWN = Sensor(
@@ -214,6 +215,13 @@ def test_every_stage_keeps_the_weights_with_the_least_loss_on_held_out_scans(
             len(losses) - 1 - losses.index(min(losses))
             <= SHORT["held_out"]["patience"] + 1
         )
+
+
+def test_flows_get_the_adapted_autoencoder(adapted: Path) -> None:
+    runs = StagedRuns(adapted.with_suffix(".adapt"), {})
+    codec = read_header(runs.checkpoint("codec"))[1]
+    for name in ("flow_town", "flow"):
+        assert read_header(runs.checkpoint(name))[0].provenance["codec"] == codec
 
 
 def test_the_autoencoder_rehearses_the_town(adapted: Path) -> None:

@@ -264,10 +264,10 @@ def _train(work: Work, start: Path, minutes: float) -> Work:
         if name in ("labels", "codec"):
             start = work.train(name, start, minutes)
             if name == "labels":
-                codec = load_checkpoint(start)
+                made = load_checkpoint(start)
                 latent: Any = Latent(
-                    codec.networks[CODEC],  # type: ignore[arg-type]
-                    codec.header.tensors,
+                    made.networks[CODEC],  # type: ignore[arg-type]
+                    made.header.tensors,
                 )
                 work = replace(
                     work, scans=label(work.scans, latent, work.folder / "labelled")
@@ -275,27 +275,9 @@ def _train(work: Work, start: Path, minutes: float) -> Work:
         elif name == "student":
             flow = work.train(name, flow, minutes)
         else:
-            begin = _with_codec(work, name, flow, start) if work.latent else flow
-            flow = work.train(name, begin, minutes)
+            codec = start if work.latent else None
+            flow = work.train(name, flow, minutes, codec)
     return work
-
-
-def _with_codec(work: Work, name: str, flow: Path, codec: Path) -> Path:
-    """The flow of one checkpoint with the autoencoder of another, as the start of a stage."""
-    path = work.folder / f"{name}_start.safetensors"
-    if not path.is_file():
-        one = load_checkpoint(flow)
-        other = load_checkpoint(codec)
-        provenance = one.header.provenance | {
-            "codec": other.hash,
-            "codec_provenance": other.header.provenance,
-        }
-        save_checkpoint(
-            path,
-            replace(one.header, provenance=provenance),
-            one.networks | {CODEC: other.networks[CODEC]},
-        )
-    return path
 
 
 def _finish(plan: AdaptPlan, work: Work, start: Path, licence: str) -> Path:

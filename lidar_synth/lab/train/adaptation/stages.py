@@ -130,7 +130,9 @@ class Work:
         """The runs of the stages."""
         return StagedRuns(self.folder, shares(self.stages))
 
-    def train(self, name: str, start: Path, limit: float) -> Path:
+    def train(
+        self, name: str, start: Path, limit: float, codec: Path | None = None
+    ) -> Path:
         """Run or resume a stage, unless it is done: more steps would change what the next one began
         with.
 
@@ -138,22 +140,27 @@ class Work:
             name: of the stage.
             start: the checkpoint that it starts from.
             limit: minutes of all stages.
+            codec: the checkpoint whose autoencoder takes the place of the start's.
 
         Returns:
             The checkpoint with the best weights.
         """
         if not self.runs.is_done(name):
             minutes = max(0.0, self.runs.budgets(limit)[name] - self.runs.spent(name))
-            run(self.config(name, start), resume=True, minutes=minutes)
+            run(self.config(name, start, codec), resume=True, minutes=minutes)
             self.runs.mark_done(name)
         return self.runs.checkpoint(name)
 
-    def config(self, name: str, start: Path) -> TrainConfig | DistillConfig:
-        """The configuration of a stage."""
+    def config(
+        self, name: str, start: Path, codec: Path | None = None
+    ) -> TrainConfig | DistillConfig:
+        """The configuration of a stage; of a flow, with another autoencoder."""
         kind: type[TrainConfig] | type[DistillConfig] = (
             DistillConfig if name == "student" else TrainConfig
         )
         values = merge(self._own(name, start), dict(self.overrides.get(name, {})))
+        if codec is not None:
+            values["codec"] = str(codec)
         return load_config(kind, self.stages[name].recipe, values=values)
 
     def _own(self, name: str, start: Path) -> dict[str, Any]:
