@@ -1,6 +1,8 @@
 """The tables of the paper by one command, with small networks on scans of the town."""
 
 import re
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,11 @@ from releases import peer_weights, write_r2flow
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import open_scans
-from lidar_synth.generate.checkpoint import read_header
+from lidar_synth.generate.checkpoint import (
+    load_checkpoint,
+    read_header,
+    save_checkpoint,
+)
 from lidar_synth.lab.evaluate import evaluate
 from lidar_synth.lab.evaluate.published import read_published
 from lidar_synth.lab.reproduce import work as work_module
@@ -107,9 +113,20 @@ def test_released_weights_take_the_place_of_a_training(
     assert len(OWN.findall(text)) == 3
     home = out / "tiny"
     assert not (home / "kitti360_teacher").exists()
-    _, digest = read_header(home / "imported" / "released.safetensors")
+    imported = home / "imported" / "released.safetensors"
+    _, digest = read_header(imported)
     header, _ = read_header(home / "kitti360_student" / "kitti360_student.safetensors")
     assert header.provenance["teacher"] == digest
+    # the student that is there is no other teacher's
+    again = ["reproduce", "table1", "--tiny", "--out", out, "--use"]
+    copied = shutil.copy(imported, tmp_path / "copied.safetensors")
+    with pytest.raises(ConfigError, match="kitti360_student with teacher='.*copied"):
+        call(*again, f"pixel.teacher={copied}")
+    made = load_checkpoint(imported)
+    other = replace(made.header, provenance=made.header.provenance | {"a": 1})
+    save_checkpoint(imported, other, made.networks)
+    with pytest.raises(ConfigError, match="which was made from another teacher than"):
+        call(*again, use)
 
 
 @pytest.mark.slow

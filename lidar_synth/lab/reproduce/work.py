@@ -31,6 +31,7 @@ from lidar_synth.lab.reproduce.tables import Task, read_tables
 from lidar_synth.lab.town import Town, export_town
 from lidar_synth.lab.train.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.lab.train.config.load import Config
+from lidar_synth.lab.train.resume import check_done
 from lidar_synth.lab.train.runs import run
 from lidar_synth.lab.train.state import Recipe, read_progress
 
@@ -160,10 +161,16 @@ class TaskRun:
         return config.selection.trajectories * config.selection.candidates
 
     def train(self, stage: str) -> None:
-        """Run a stage, or what is left of it."""
+        """Run a stage, or what is left of it.
+
+        Raises:
+            ConfigError: if it was done with other settings, or from other checkpoints.
+        """
         config = self.config(stage)
         if read_progress(config.output).step < config.recipe.iterations:
             run(config, resume=True, minutes=self.minutes)
+        else:
+            check_done(config)
 
     def sample(self, stage: str, steps: int) -> Path:
         """Generate the scans of a row."""

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.loading import shipped_models
 from lidar_synth.lab.train.config import (
     PARENTS,
     DistillConfig,
@@ -21,6 +20,7 @@ from lidar_synth.lab.train.config import (
     published_models,
     read_values,
 )
+from lidar_synth.lab.train.resume import is_missing
 from lidar_synth.lab.train.schedules import ENDLESS
 from lidar_synth.lab.train.staged import StagedRuns
 
@@ -177,12 +177,6 @@ def plan_model(
     plan = ModelPlan(name, folder, stages, limit, out)
     _check_minutes(plan)
     return plan
-
-
-def is_missing(path: Path) -> bool:
-    """Whether there is no checkpoint to start from: neither a file nor a shipped model of that
-    name."""
-    return str(path) not in shipped_models() and not path.is_file()
 
 
 def _split(

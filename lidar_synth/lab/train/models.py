@@ -20,9 +20,8 @@ from lidar_synth.generate.checkpoint import (
     read_header,
     save_checkpoint,
 )
-from lidar_synth.generate.loading import find_model
-from lidar_synth.lab.train.model_plan import ModelPlan, is_missing
-from lidar_synth.lab.train.resume import check_resumed
+from lidar_synth.lab.train.model_plan import ModelPlan
+from lidar_synth.lab.train.resume import check_done, is_missing
 from lidar_synth.lab.train.runs import run
 from lidar_synth.lab.train.staged import iterations_of, set_iterations, train_for
 
@@ -97,20 +96,11 @@ def _still_done(plan: ModelPlan, name: str) -> bool:
     """Whether a stage that is done needs no more iterations; other settings and other starts are
     refused."""
     stage = plan.stages[name]
-    folder = plan.runs.folder_of(name)
     done = iterations_of(stage.config)
     config = (
         stage.config if stage.minutes is None else set_iterations(stage.config, done)
     )
-    check_resumed(config)
-    facts = read_header(plan.runs.checkpoint(name))[0].provenance
-    for key, path in stage.starts.items():
-        if not is_missing(path) and facts.get(key) != read_header(find_model(path))[1]:
-            raise ConfigError(
-                f"{folder}, which was made from another {key} than {path} is now",
-                "the same one",
-                f"Remove {folder} to run the stage again, or give another output=FOLDER.",
-            )
+    check_done(config)
     return config.recipe.iterations == done
 
 

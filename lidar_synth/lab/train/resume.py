@@ -1,10 +1,12 @@
 """What a run may be resumed with: the settings that it began with, and more iterations."""
 
 from collections.abc import Container, Mapping
+from pathlib import Path
 from typing import Any
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import Header, read_header
+from lidar_synth.generate.loading import find_model, shipped_models
 from lidar_synth.lab.train.config import PARENTS, Run, read_values, validate
 from lidar_synth.lab.train.config.load import Config
 from lidar_synth.lab.train.schedules import SCHEDULES
@@ -85,6 +87,34 @@ def check_parents(config: Run, header: Header) -> None:
         _refuse_others(config, PARENTS, before, header.provenance)
 
 
+def check_done(config: Run) -> None:
+    """Refuse to keep a finished run with other settings than it had, or if a checkpoint that it
+    started from is another one now.
+
+    Raises:
+        ConfigError: naming what differs, and as ``check_resumed``.
+        FileError, DataError: where the run cannot be read.
+    """
+    check_resumed(config)
+    facts = read_header(config.checkpoint)[0].provenance
+    for key in PARENTS:
+        path = getattr(config, key, None)
+        if path is None or is_missing(path):
+            continue
+        if facts.get(key) != read_header(find_model(path))[1]:
+            raise ConfigError(
+                f"{config.output}, which was made from another {key} than {path} is now",
+                "the same one",
+                f"Remove {config.output} to run the stage again, or give another folder.",
+            )
+
+
+def is_missing(path: Path) -> bool:
+    """Whether there is no checkpoint to start from: neither a file nor a shipped model of that
+    name."""
+    return str(path) not in shipped_models() and not path.is_file()
+
+
 def _refuse_others(
     config: Run,
     keys: Container[str],
@@ -104,7 +134,7 @@ def _refuse_others(
         f"--resume of {config.output} with {', '.join(named[:_SHOWN])}{more}",
         "the settings that it began with; more recipe.iterations, or fewer before the rate "
         "falls, are allowed",
-        "Give those, or another output=FOLDER for a new run.",
+        "Give those, or another folder for a new run (output=FOLDER, --out of reproduce).",
     )
 
 
