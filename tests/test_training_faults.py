@@ -88,6 +88,24 @@ def test_a_checkpoint_that_could_not_be_written_is_written_by_the_next_run(
     assert read_progress(tmp_path / "run").step == 4 and again["iterations"] == 4
 
 
+def test_a_removed_checkpoint_is_written_again(tmp_path: Path) -> None:
+    given = config(tmp_path / "run", "recipe.iterations=2")
+    made = run(given)
+    _, before = read_header(made)
+    made.unlink()
+    assert read_header(run(given, resume=True))[1] == before
+
+
+def test_removed_weights_that_were_better_than_the_last_are_missed(
+    tmp_path: Path,
+) -> None:
+    # At this rate the loss grows.
+    given = config(tmp_path / "run", "recipe.iterations=2", HELD, "recipe.rate=0.5")
+    run(given).unlink()
+    with pytest.raises(ConfigError, match="run.safetensors, which is missing; exp"):
+        run(given, resume=True)
+
+
 @pytest.mark.slow
 def test_the_rate_falls_after_a_plateau_that_patience_has_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -167,7 +167,8 @@ class TaskRun:
             ConfigError: if it was done with other settings, or from other checkpoints.
         """
         config = self.config(stage)
-        if read_progress(config.output).step < config.recipe.iterations:
+        done = read_progress(config.output).step >= config.recipe.iterations
+        if not (done and config.checkpoint.exists()):
             run(config, resume=True, minutes=self.minutes)
         else:
             check_done(config)

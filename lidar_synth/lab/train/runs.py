@@ -76,7 +76,7 @@ def run(
 
     Raises:
         ConfigError: if the folder holds a run and ``resume`` is not set, or holds a run with other
-            settings.
+            settings, or one whose best weights were removed.
         LibraryError: if Accelerate (extra ``train``) is not installed.
         DataError: if the loss becomes NaN or infinite; the last saved state is kept.
         KeyboardInterrupt: on SIGINT or SIGTERM, after the state was saved; at once on a second one.
@@ -315,6 +315,7 @@ class _Keeper:
             if not self.watch.measured:
                 self.save_checkpoint()
                 self.save_state()
+        self.restore_checkpoint()
         logs = self.config.output / "logs"
         self.board: Any = SummaryWriter(logs, purge_step=training.step + 1)
         self.bar = tqdm(
@@ -324,6 +325,24 @@ class _Keeper:
             unit="step",
         )
         self.records: list[Record] = []
+
+    def restore_checkpoint(self) -> None:
+        """Write the checkpoint of a resumed run again, if it was removed.
+
+        Raises:
+            ConfigError: if it had other weights than the last ones.
+        """
+        path = self.config.checkpoint
+        ended = self.training.step >= self.config.recipe.iterations
+        if path.exists() or not (self.watch or ended):
+            return
+        self.save_checkpoint()
+        if not path.exists():
+            raise ConfigError(
+                f"{path}, which is missing",
+                "the file of this run, which had the best weights on held-out scans",
+                "Put it back, or give another output=FOLDER.",
+            )
 
     @property
     def exhausted(self) -> bool:
