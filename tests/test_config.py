@@ -136,6 +136,12 @@ def test_an_unknown_name_is_refused_with_the_known_ones(
         load_config(TrainConfig, name)
 
 
+def test_an_autoencoder_of_surfaces_needs_labels() -> None:
+    given = ["channels=[range,reflectance]", "data.town=1"]
+    with pytest.raises(ConfigError, match="expected channels range, reflectance, "):
+        load_config(TrainConfig, "town_codec", given)
+
+
 def test_the_published_recipes() -> None:
     teacher = load_config(TrainConfig, CONFIGS / "kitti360_teacher.yaml")
     assert teacher.parts((2, 64, 1024), (64, 1024))["velocity"].arguments[

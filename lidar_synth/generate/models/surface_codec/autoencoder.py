@@ -96,7 +96,7 @@ class SurfaceAutoencoder(BoundedAutoencoder):
             raise ConfigError(
                 f"{channels} channels, {codes} codes in {bits} bits, normalisation "
                 f"{normalisation!r}",
-                "range, reflectance and enough bits for the codes; one of "
+                "channels range, reflectance, label, with bits for 2 or more codes; one of "
                 f"{', '.join(NORMALISATIONS)}",
             )
         # a patch of half the columns has a shared number for each in a row
