@@ -207,6 +207,25 @@ def test_the_town_and_paths_become_sources(
         disk.data.open(load_sensor(disk.sensor))
 
 
+def test_scans_are_read_with_the_options_of_open_scans(tmp_path: Path) -> None:
+    points = np.array(2 * [[5, 0, 0, 255, 3], [0, 9, 0, 51, 4]], np.float32)
+    points.tofile(tmp_path / "0.bin")
+    given = ["data.town=null", f"data.path={tmp_path}"]
+    grid = load_sensor("vlp16")
+    plain = load_config(TrainConfig, TINY, given).data
+    with pytest.raises(DataError, match="on another scale"):
+        plain.open(grid)[0]
+    given += ["data.fields=5", "data.reflectance_max=255", "data.sensor=os1_128"]
+    data = load_config(TrainConfig, TINY, given).data
+    scan = data.open(grid)[0]
+    assert scan.reflectance is not None
+    assert scan.reflectance.tolist() == pytest.approx(2 * [1.0, 0.2])
+    assert scan.sensor == load_sensor("os1_128")
+    facts = data.describe()
+    own = {"fields": 5, "reflectance_max": 255.0, "sensor": scan.sensor.to_dict()}
+    assert facts == plain.describe() | own  # caches without them stay
+
+
 def test_several_sets_of_scans_follow_each_other() -> None:
     more = "data.more=[{town: 3, seed: 5, licence: MIT}]"
     config = load_config(TrainConfig, TINY, [more])

@@ -8,15 +8,19 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from torch.utils.data import ConcatDataset
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.formats import open_scans
+from lidar_synth.formats import OnBad, open_scans
 from lidar_synth.generate.checkpoint import NetworkSpec
 from lidar_synth.generate.models import encoders_of, network_class
 from lidar_synth.geometry.scan import Source
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.train.state import Recipe
 
 Count = Annotated[int, Field(ge=1)]
+
+READING = {"layout", "split", "on_bad"}
+LATER = {"sensor", "fields", "topic", "reflectance_max"}
+"""Keys of ``Data`` that are options of ``open_scans``; ``LATER`` came after the first caches."""
 
 
 class Section(BaseModel):
@@ -35,8 +39,8 @@ class Data(Section):
         interval: seconds between consecutive scans of the town.
         motion: whether the town's vehicle moves while the sensor turns.
         path: a dataset's root, a folder or a file; environment variables are expanded.
-        layout, split: as for ``open_scans``.
-        on_bad: "error", or "skip" to leave out scans that cannot be read.
+        layout, split, fields, topic, reflectance_max, on_bad: as for ``open_scans``.
+        sensor: of the scans, as for ``open_scans``: a preset's name or a YAML file.
         cache: folder of the projected scans; by default ``cache`` in the output folder. It is
             refused if a file of the scans has another size or modification time since.
         jobs: processes that project the scans for the cache, without images.
@@ -57,7 +61,11 @@ class Data(Section):
     path: str | None = None
     layout: str | None = None
     split: str | None = None
-    on_bad: Literal["error", "skip"] = "error"
+    sensor: str | None = None
+    fields: Count | None = None
+    topic: str | None = None
+    reflectance_max: float | None = None
+    on_bad: OnBad = "error"
     cache: Path | None = None
     jobs: Count = 1
     flip: bool | Literal["both"] = False
@@ -84,9 +92,7 @@ class Data(Section):
                 "variables that are set",
                 "Or give data.path=FOLDER.",
             )
-        return open_scans(
-            path, layout=self.layout, split=self.split, on_bad=self.on_bad
-        )
+        return open_scans(path, **self.model_dump(include=READING | LATER))
 
     def parts(self) -> "list[Data]":
         """These scans without ``more``, then those."""
@@ -94,15 +100,14 @@ class Data(Section):
 
     def describe(self) -> dict[str, Any]:
         """What tells these scans from others, plain values."""
-        keys = (
-            {"seed", "interval", "motion"}
-            if self.path
-            else {"path", "layout", "split", "on_bad"}
-        )
-        # caches of earlier versions do not name it
+        keys = {"seed", "interval", "motion"} if self.path else {"path"} | READING
+        # caches of earlier versions do not name them
         keys |= {"motion"} if self.motion else set()
+        keys |= {key for key in LATER if getattr(self, key) is None}
         keys |= {"cache", "jobs", "flip", "roll", "latents", "seen", "more"}
         facts = self.model_dump(mode="json", exclude=keys)
+        if self.sensor is not None:
+            facts["sensor"] = load_sensor(self.sensor).to_dict()
         if self.more:
             facts["more"] = [one.describe() for one in self.more]
         return facts
