@@ -316,10 +316,11 @@ def test_the_camera_of_another_focal_length_is_refused(
         shutil.copytree(kitti, other)
         file = other / "calibration" / "perspective.txt"
         file.write_text(text) if text else shutil.rmtree(file.parent)
-        with pytest.raises(
-            DataError, match=f"a camera with {found}; expected 552.5 pixels"
-        ):
+        refused = f"a camera with {found}; expected 552.5 pixels"
+        with pytest.raises(DataError, match=refused):
             conditions_for(generator, str(other))
+        with pytest.raises(DataError, match=refused):
+            call("train", config, f"data.path={other}", f"output={other}-run")
 
 
 @pytest.mark.slow

@@ -147,15 +147,23 @@ def conditions_for(
             f"a dataset whose scans have {generator.condition}",
         )
     if isinstance(source, ScanFiles) and generator.condition:
-        _check_camera(
+        check_camera(
             source, generator.header.conditioning[generator.condition].get("focal")
         )
     return source
 
 
-def _check_camera(source: ScanFiles, focal: float | None) -> None:
+def check_camera(source: ScanFiles, focal: float | None) -> None:
     """Refuse a camera of another focal length: its images have another field of view than those of
-    the training."""
+    the training.
+
+    Args:
+        source: of the images.
+        focal: pixels, as the model's header says it; None = any.
+
+    Raises:
+        DataError: on a camera without calibration, or of another focal length.
+    """
     if focal is None:
         return
     camera = source.calibration(0)
@@ -168,7 +176,7 @@ def _check_camera(source: ScanFiles, focal: float | None) -> None:
         )
         raise DataError(
             f"{source.root}: a camera with {given}",
-            f"{focal:.1f} pixels, the focal length that the model was trained with",
+            f"{focal:.1f} pixels, the focal length of the model's training (condition.focal)",
             "Crop and resize the images to that field of view, and change the dataset's "
             "calibration files accordingly.",
         )

@@ -16,7 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from lidar_synth.bake.conditions import check_camera
 from lidar_synth.errors import ConfigError
+from lidar_synth.formats import ScanFiles
 from lidar_synth.generate.checkpoint import (
     CODEC,
     ENCODER,
@@ -114,6 +116,7 @@ class Stage:
 
         Raises:
             ConfigError: on scans that are mirrored or turned, with a condition that cannot be.
+        DataError: on images of another camera than ``condition.focal`` says.
         """
         given = self.config.data if data is None else data
         sensor = self.header.sensor
@@ -191,6 +194,9 @@ class Stage:
         encoder = self.parts(self.network)[ENCODER]
         shape = CONDITIONS[name].shape(encoder)
         sensor = self.header.sensor
+        for part in getattr(source, "datasets", [source]):
+            if isinstance(part, ScanFiles):
+                check_camera(part, options.get("focal"))
 
         def read(i: int, scan: Scan) -> NDArray[np.uint8]:
             if name == "camera" and isinstance(source, Town):  # rendered when needed
