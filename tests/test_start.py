@@ -127,6 +127,13 @@ def test_a_student_that_is_trained_further_keeps_its_own_networks(
     stage = student(tmp_path, TEACHER, f"init={path}")
     assert stage.header.networks == header.networks
     assert stage.network.window == (3, 5)
+    save_checkpoint(path, replace(header, other_grids=()), town.networks)
+    given = [f"init={path}", "also=[]"]
+    student(tmp_path, TEACHER, *given, f"grid={list(header.time_grid)}")
+    with pytest.raises(
+        ConfigError, match=r"grid \(1.0, 0.9.* with init .*its own, \(1"
+    ):
+        student(tmp_path, TEACHER, *given, "grid=[1, 0.9, 0.8, 0.1, 0]")
 
 
 def test_times_of_autoguidance_need_a_weaker_teacher(tmp_path: Path) -> None:

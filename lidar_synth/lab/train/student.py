@@ -158,8 +158,8 @@ def _take_start(
     """Take the networks and the times of a student that is trained further.
 
     Raises:
-        ConfigError: if it is the student of another kind of teacher, of one on other latents, or of
-            other numbers of steps.
+        ConfigError: if it is the student of another kind of teacher, of one on other latents, of
+            other numbers of steps, or of other times than ``config.grid``.
     """
     differs = _differences(teacher, start)
     grids = (start.header.time_grid, *start.header.other_grids)
@@ -170,6 +170,12 @@ def _take_start(
             f"init {config.init} with "
             + (f"another {', '.join(differs)}" if differs else f"{intervals} steps"),
             f"a student of {config.teacher} in {wanted} steps",
+        )
+    if config.grid not in (None, grids[0]):
+        raise ConfigError(
+            f"grid {config.grid} with init {config.init}",
+            f"its own, {grids[0]}",
+            "Or leave out grid (grid=null).",
         )
     made = {"init": start.hash, "init_provenance": start.header.provenance}
     return replace(
