@@ -9,12 +9,13 @@ import copy
 import hashlib
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -34,6 +35,24 @@ STATE = "state.safetensors"
 
 MOMENTS = ({"step", "exp_avg", "exp_avg_sq"}, {"momentum_buffer"})
 """What AdamW and Muon keep of a weight."""
+
+
+LIMITS: dict[str, tuple[tuple[str, ...], Callable[[float], bool]]] = {
+    "at least 1": (
+        ("iterations", "batch", "accumulate", "ema_every"),
+        lambda number: number >= 1,
+    ),
+    "above 0 (a large clip, such as 1.0e+9, does not clip)": (
+        ("rate", "clip"),
+        lambda number: number > 0,
+    ),
+    "at least 0": (
+        ("warmup", "ema_after", "weight_decay"),
+        lambda number: number >= 0,
+    ),
+    "at least 0, below 1": (("betas", "ema_decay"), lambda number: 0 <= number < 1),
+}
+"""{what is expected: the keys of a ``Recipe``, and whether a number of theirs fits}."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +78,7 @@ class Recipe:
             own; 0 = from the first step.
 
     Raises:
-        ConfigError: on an unknown name or a number below 1.
+        ConfigError: on an unknown name, or a number out of its ``LIMITS``.
     """
 
     # Used when a configuration is validated.
@@ -98,16 +117,10 @@ class Recipe:
                 f"weights {dict(self.weights)}",
                 f"numbers above 0 for some of {', '.join(CHANNELS)}",
             )
-        if (
-            min(self.iterations, self.batch, self.accumulate, self.ema_every) < 1
-            or not self.rate > 0
-            or not self.clip > 0
-        ):
-            raise ConfigError(
-                f"{self}",
-                "iterations, batch, accumulate, ema_every of at least 1, a rate and a clip above "
-                "0 (a large clip, such as 1.0e+9, does not clip)",
-            )
+        for expected, (keys, fits) in LIMITS.items():
+            for key in keys:
+                if not all(map(fits, np.ravel(getattr(self, key)))):
+                    raise ConfigError(f"{key} {getattr(self, key)}", expected)
 
 
 def kept_share(recipe: Recipe, step: int) -> float:
