@@ -207,6 +207,18 @@ def test_the_town_and_paths_become_sources(
         disk.data.open(load_sensor(disk.sensor))
 
 
+def test_a_roll_of_one_is_a_degree() -> None:
+    for given, roll in (("1", 1.0), ("0", 0.0), ("true", True), ("false", False)):
+        found = load_config(TrainConfig, TINY, [f"data.roll={given}"]).data.roll
+        assert found == roll and type(found) is type(roll)
+
+
+@pytest.mark.parametrize("also", ["[4]", "[2, 2]"])
+def test_a_student_learns_each_number_of_steps_once(also: str) -> None:
+    with pytest.raises(ConfigError, match=r"intervals=4 with also=.*expected each num"):
+        load_config(DistillConfig, "town_student", [f"also={also}"])
+
+
 def test_scans_are_read_with_the_options_of_open_scans(tmp_path: Path) -> None:
     points = np.array(2 * [[5, 0, 0, 255, 3], [0, 9, 0, 51, 4]], np.float32)
     points.tofile(tmp_path / "0.bin")
@@ -281,6 +293,7 @@ def test_several_sets_of_scans_follow_each_other() -> None:
         ("network.architecture=resnet", "architecture 'resnet'; expected one of"),
         ("data.path=here", "data with town=40 and path=here; expected one of the two"),
         ("data.town=null", "expected one of the two"),
+        ("data.roll=-1", "data.roll"),
         ("rehearsal={licence: MIT}", "expected one of the two"),
         ("data.more=[{licence: MIT}]", "expected one of the two"),
         ("precision=fp8", "precision = 'fp8'"),

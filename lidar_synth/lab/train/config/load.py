@@ -103,7 +103,13 @@ def check(config: Run) -> None:
 
 def _check_distill(config: DistillConfig) -> None:
     candidates = config.selection.candidates
-    most = max((config.intervals, *config.also))
+    counts = (config.intervals, *config.also)
+    if len(set(counts)) < len(counts):
+        raise ConfigError(
+            f"intervals={config.intervals} with also={list(config.also)}",
+            "each number of steps once",
+        )
+    most = max(counts)
     if config.selects and most > candidates:
         raise ConfigError(
             f"{most} steps of selection.candidates={candidates} times",

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool
 from torch.utils.data import ConcatDataset
 
 from lidar_synth.errors import ConfigError
@@ -69,7 +69,7 @@ class Data(Section):
     cache: Path | None = None
     jobs: Count = 1
     flip: bool | Literal["both"] = False
-    roll: bool | Annotated[float, Field(gt=1, le=180)] = False
+    roll: StrictBool | Annotated[float, Field(ge=0, le=180)] = False
     latents: bool = False
     seen: list[dict[str, Any]] | None = None
     more: "tuple[Data, ...]" = ()
