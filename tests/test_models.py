@@ -370,6 +370,14 @@ ERRORS: dict[str, tuple[list[str], str]] = {
         ["town", "codec.output=here"],
         r"override 'codec.output=here'; expected STAGE.KEY",
     ),
+    "minutes that are no number": (
+        ["town", "--minutes", "nan"],
+        "--minutes nan for the stages .* expected at least",
+    ),
+    "minutes without end": (
+        ["town", "--minutes", "inf"],
+        "--minutes inf for the stages .* expected at least",
+    ),
     "too few minutes": (
         ["town", "--minutes", "0.01"],
         r"--minutes 0.01 for the stages codec, teacher, student, decoder of town; expected at "

@@ -240,6 +240,14 @@ def test_two_processes_train_as_one(scans: Path, tmp_path: Path) -> None:
     assert len(list((tmp_path / "two" / "run" / "logs").iterdir())) == 1
 
 
+@pytest.mark.parametrize("minutes", ["-1", "nan", "inf"])
+def test_minutes_that_are_no_time_are_refused(minutes: str, tmp_path: Path) -> None:
+    given = ["town_tiny", f"output={tmp_path / 'run'}", "--minutes", minutes]
+    with pytest.raises(ConfigError, match="minutes; expected a finite number of at l"):
+        call("train", *given)
+    assert not (tmp_path / "run").exists()
+
+
 def test_minutes_stop_a_run_and_resume_goes_on(
     scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

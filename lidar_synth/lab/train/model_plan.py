@@ -1,5 +1,6 @@
 """The plan of a model: the runs of its stages, checked before the first one begins."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -265,7 +266,7 @@ def _check_minutes(plan: ModelPlan) -> None:
     if not shares:
         return
     least = LEAST * sum(shares.values()) / min(shares.values())
-    if plan.minutes < least:
+    if not least <= plan.minutes < math.inf:
         raise ConfigError(
             f"--minutes {plan.minutes:g} for the stages {', '.join(shares)} of {plan.name}",
             f"at least {least:.2g}",

@@ -69,14 +69,14 @@ def run(
             (``load_config``).
         resume: continue from the state in the output folder, if there is one; the settings must be
             the same.
-        minutes: save and stop after this time.
+        minutes: save and stop after this time; 0 = after one step.
 
     Returns:
         Path of the checkpoint, which ``load_generator`` reads.
 
     Raises:
         ConfigError: if the folder holds a run and ``resume`` is not set, or holds a run with other
-            settings, or one whose best weights were removed.
+            settings, or one whose best weights were removed; on minutes that are no time.
         LibraryError: if Accelerate (extra ``train``) is not installed.
         DataError: if the loss becomes NaN or infinite; the last saved state is kept.
         KeyboardInterrupt: on SIGINT or SIGTERM, after the state was saved; at once on a second one.
@@ -87,6 +87,8 @@ def run(
         >>> run(load_config(TrainConfig, "town_tiny", [*changes, "output=runs/mine"])).as_posix()
         'runs/mine/mine.safetensors'
     """
+    if minutes is not None and not 0 <= minutes < math.inf:
+        raise ConfigError(f"{minutes} minutes", "a finite number of at least 0")
     state = config.output / STATE
     if state.exists():
         _check_resumable(config, resume)
