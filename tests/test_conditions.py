@@ -482,7 +482,9 @@ def test_a_cache_with_images_resumes_and_refuses_other_images(tmp_path: Path) ->
     )
     assert np.array_equal(cache.fields["camera"], again.fields["camera"])
     assert again.read([1])["camera"].dtype == torch.uint8
-    with pytest.raises(ConfigError, match=r"the cache of other data \(others differ\)"):
+    with pytest.raises(
+        ConfigError, match=r"the cache of other data \(others.camera differ\)"
+    ):
         cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False)
 
 

@@ -146,12 +146,30 @@ def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(
     third = Counted(scans)
     cache_scans(third, SENSOR, ["range"], tmp_path, {"town": 150}, progress=False)
     assert third.reads == 0
-    with pytest.raises(ConfigError, match=r"cache of other data \(source differ\)"):
+    with pytest.raises(
+        ConfigError, match=r"cache of other data \(source.town differ\)"
+    ):
         cache_scans(scans, SENSOR, ["range"], tmp_path, {"town": 151}, progress=False)
     with pytest.raises(ConfigError, match="channels"):
         cache_scans(
             scans, SENSOR, ["range", "label"], tmp_path, {"town": 150}, progress=False
         )
+
+
+def test_a_cache_does_not_depend_on_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROOT_OF_SCANS", str(tmp_path))
+    scans = Counted(SCANS)
+    for path, licence in (("a", "x"), ("./a", "y"), ("$ROOT_OF_SCANS/a", "x")):
+        told = {"path": path, "licence": licence}
+        several = told | {"more": [told]}
+        cache_scans(scans, SENSOR, ["range"], Path("kept"), several, progress=False)
+    assert scans.reads == len(SCANS)
+    with pytest.raises(ConfigError, match=r"data \(source.path, source.more differ"):
+        other = {"path": "b", "more": []}
+        cache_scans(scans, SENSOR, ["range"], Path("kept"), other, progress=False)
 
 
 @pytest.mark.parametrize("several", [False, True])

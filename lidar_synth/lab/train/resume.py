@@ -21,9 +21,13 @@ HARMLESS = {
     "gradient_checkpointing",
     "data.cache",
     "data.jobs",
+    "licence",
+    "data.licence",
+    "held_out.data.licence",
+    "rehearsal.licence",
 }
-"""Keys that change where things lie, how much is written and how fast it goes, and not what is
-learned."""
+"""Keys that change where things lie, how much is written, what is said of it and how fast it goes,
+and not what is learned."""
 MORE = "recipe.iterations"
 """What may grow, and may shrink before the learning rate falls."""
 _SHOWN = 4  # differences in one message

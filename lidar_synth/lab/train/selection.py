@@ -27,7 +27,7 @@ from lidar_synth.lab.train.config import DistillConfig
 from lidar_synth.lab.train.data import Batches
 from lidar_synth.lab.train.loop import weigh_metric
 from lidar_synth.lab.train.ranks import ALONE, Ranks
-from lidar_synth.lab.train.resume import flatten
+from lidar_synth.lab.train.resume import HARMLESS, flatten
 from lidar_synth.lab.train.state import checksum_of
 
 SAVE_SECONDS = 10.0
@@ -173,7 +173,8 @@ def load_costs(path: Path, settings: dict[str, Any]) -> TrajectoryCosts:
             f"{path} is damaged ({error})", "a selection of timesteps"
         ) from error
     made = parse_json(text, str(path))
-    other = sorted(k for k in made | settings if made.get(k) != settings.get(k))
+    keys = (made | settings).keys() - HARMLESS
+    other = sorted(k for k in keys if made.get(k) != settings.get(k))
     if other:
         raise ConfigError(
             f"{path}, which was made with "
