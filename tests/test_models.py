@@ -370,6 +370,10 @@ ERRORS: dict[str, tuple[list[str], str]] = {
         ["town", "codec.output=here"],
         r"override 'codec.output=here'; expected STAGE.KEY",
     ),
+    "a sensor that the flow cannot have": (
+        ["town", "codec.sensor=vlp16"],
+        r"sensor 'vlp16' of 16 x 1808 cells, whose latents have 4 x 113: resolution \(4, ",
+    ),
     "minutes that are no number": (
         ["town", "--minutes", "nan"],
         "--minutes nan for the stages .* expected at least",

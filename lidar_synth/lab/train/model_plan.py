@@ -21,6 +21,7 @@ from lidar_synth.lab.train.config import (
     published_models,
     read_values,
 )
+from lidar_synth.lab.train.config.load import check_latents
 from lidar_synth.lab.train.resume import is_missing
 from lidar_synth.lab.train.schedules import ENDLESS
 from lidar_synth.lab.train.staged import StagedRuns
@@ -177,6 +178,7 @@ def plan_model(
     out = runs.checkpoint(last) if until else folder / f"{name}.safetensors"
     plan = ModelPlan(name, folder, stages, limit, out)
     _check_minutes(plan)
+    _check_latents(plan)
     return plan
 
 
@@ -259,6 +261,16 @@ def _needed(
             starts = stages[name].starts.values()
             needed |= {other for other in stages if runs.checkpoint(other) in starts}
     return {name: stage for name, stage in stages.items() if name in needed}
+
+
+def _check_latents(plan: ModelPlan) -> None:
+    made = {plan.runs.checkpoint(name): stage for name, stage in plan.stages.items()}
+    for stage in plan.stages.values():
+        flow = stage.config
+        if isinstance(flow, TrainConfig) and flow.codec in made:
+            codec = made[flow.codec].config
+            if isinstance(codec, TrainConfig) and codec.init is None:
+                check_latents(flow, codec)
 
 
 def _check_minutes(plan: ModelPlan) -> None:

@@ -5,13 +5,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import torch
 from pydantic import BaseModel
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.files.recipes import find_recipe, merge, read_recipe, validate
+from lidar_synth.generate.checkpoint import CODEC
+from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.flow.distill import UNIFORM, check_uniform
 from lidar_synth.generate.flow.solvers import read_grid
+from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.train.config.sections import Run
 from lidar_synth.lab.train.config.training import DistillConfig, TrainConfig
@@ -147,6 +151,29 @@ def _check_train(config: TrainConfig) -> None:
     if config.init is None and config.codec is None:
         resolution = load_sensor(config.sensor).shape
         config.parts((config.tensors().size, *resolution), resolution)
+
+
+def check_latents(flow: TrainConfig, codec: TrainConfig) -> None:
+    """Refuse a flow on the latents of an autoencoder that is to be trained first, if its networks
+    cannot have their shape.
+
+    Raises:
+        ConfigError: naming the sensor of the autoencoder.
+    """
+    sensor = load_sensor(codec.sensor)
+    rows, columns = sensor.shape
+    tensors = codec.tensors()
+    parts = codec.parts((tensors.size, rows, columns), sensor.shape)
+    with torch.device("meta"):
+        network = build_network(*parts[CODEC])
+    state = make_codec(network, tensors, sensor.shape).shape
+    try:
+        flow.parts(state, sensor.shape)
+    except ConfigError as error:
+        raise ConfigError(
+            f"sensor {sensor.name!r} of {rows} x {columns} cells, whose latents have {state[1]} x "
+            f"{state[2]}: {error}"
+        ) from error
 
 
 def _override(values: dict[str, Any], override: str) -> None:
