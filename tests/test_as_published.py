@@ -48,6 +48,10 @@ NONE = {
     "data.town": None,
     "data.latents": False,
     "data.seen": None,
+    "data.sensor": None,
+    "data.fields": None,
+    "data.topic": None,
+    "data.reflectance_max": None,
     "recipe.weights": {},
     "recipe.optimizer": "adamw",
 }
