@@ -369,7 +369,7 @@ def test_a_file_is_the_layout_that_it_describes(tmp_path: Path) -> None:
 BAD = {
     "objects: [{class: Dragon, at: [9, 0]}]": (
         ConfigError,
-        "class 'Dragon'; expected one of Car, Van",
+        "class 'Dragon'; expected one of 'Car', 'Van'",
     ),
     "objects: [{class: Car}]": (ConfigError, r"objects\.0\.at: Field required"),
     "objects: [{class: Car, at: [9, .nan]}]": (ConfigError, r"objects\.0\.at\.1"),
