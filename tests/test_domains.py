@@ -3,6 +3,7 @@ scans, statistics and layers by domain."""
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from lidar_synth import (
 )
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError
+from lidar_synth.formats import WRITERS
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels.augment import drop_reflectance
@@ -235,6 +237,23 @@ def test_settings_of_trainers_take_a_schedule_by_name() -> None:
     mixed.set_epoch(19)
     assert [mixed[i] for i in range(8)] != []
     assert sum(mixed.domain(i) for i in range(8)) == 0
+
+
+def test_settings_name_the_folder_of_the_real_scans_that_a_policy_mixes_in(
+    tmp_path: Path,
+) -> None:
+    writer = WRITERS["npz"](tmp_path)
+    writer.write(REAL[0], 0)
+    writer.finish()
+    settings = {"synthetic": SYNTHETIC, "ratio": 0.5}
+
+    def scans(real: Any) -> list[Any]:
+        labels = {"lasermix": {"real": real}}
+        mixed = mix_for_trainer(4, settings | {"labels": labels})
+        return [mixed[i] for i in range(len(mixed)) if mixed.domain(i)]
+
+    for found, wanted in zip(scans(str(tmp_path)), scans(REAL[:1]), strict=True):
+        assert np.array_equal(found.points, wanted.points)
 
 
 def test_settling_takes_the_statistics_of_its_batches_alone() -> None:

@@ -261,6 +261,9 @@ def wrong_labels(label: int) -> Any:
 class OneByOne(IterableDataset[Any]):
     """A trainer's samples without numbers."""
 
+    def __len__(self) -> int:
+        return 5
+
     def __iter__(self) -> Any:
         return iter(range(5))
 

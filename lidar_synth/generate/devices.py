@@ -1,5 +1,7 @@
 """The devices that torch can compute on."""
 
+from contextlib import AbstractContextManager
+
 import torch
 from torch.utils.data import get_worker_info
 
@@ -63,3 +65,11 @@ def refuse_worker(device: torch.device | str) -> None:
             "process fills, (C) mix in the main process, on the training device",
             "On the CPU, load_generator(..., device='cpu') works in workers too.",
         )
+
+
+def without_autocast(device: torch.device) -> AbstractContextManager[None]:
+    """A context in which the caller's ``torch.autocast``, with which a generator would give other
+    scans, has no effect."""
+    # torch 2.4 knows none for "mps".
+    kind = device.type if torch.amp.is_autocast_available(device.type) else "cpu"
+    return torch.autocast(kind, enabled=False)

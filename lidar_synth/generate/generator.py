@@ -24,7 +24,7 @@ from lidar_synth.generate.card import model_card
 from lidar_synth.generate.checkpoint import Header, read_header
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, blank
-from lidar_synth.generate.devices import refuse_worker
+from lidar_synth.generate.devices import refuse_worker, without_autocast
 from lidar_synth.generate.flow.guidance import guide
 from lidar_synth.generate.flow.path import Velocity
 from lidar_synth.generate.flow.solvers import mean_velocity, read_grid, solve
@@ -331,11 +331,7 @@ class Generator:
         for first in range(0, len(indices), self.batch):
             part = slice(first, first + self.batch)
             noise, draws = self.draw_noise(seed, indices[part], self.sensor)
-            # The caller's autocast would give other scans.
-            with (
-                torch.inference_mode(),
-                torch.autocast(self.device.type, enabled=False),
-            ):
+            with torch.inference_mode(), without_autocast(self.device):
                 own = None if given is None else given[part]
                 velocity, cond = self._flow(own, guidance, grid)
                 state = solve(velocity, noise, grid, solver, cond)

@@ -18,6 +18,7 @@ from torch.nn.functional import adaptive_max_pool2d
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.generate.devices import without_autocast
 from lidar_synth.generate.flow.solvers import mean_velocity, solve
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.scan import RangeImage
@@ -120,7 +121,7 @@ def _batch(
     inside = adaptive_max_pool2d(mask, codec.shape[1:]) > 0
     sensor = generator.header.sensor
     noise, draws = generator.draw_noise(seed, indices, sensor)
-    with torch.inference_mode(), torch.autocast(device.type, enabled=False):
+    with torch.inference_mode(), without_autocast(device):
         known = codec.encode(generator.tensors.from_images(images).to(device))
         state = codec.decode(_sample(generator, known, noise, inside, start), draws)
     results = []

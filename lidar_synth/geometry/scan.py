@@ -411,9 +411,13 @@ def check_source(source: Any) -> None:
     """Refuse what gives no scans by number.
 
     Raises:
-        ConfigError: on a path, a dict, a single scan, or what has no length.
+        ConfigError: on a path, a dict, a single scan, an ``IterableDataset``, or what has no
+            length.
     """
-    if isinstance(source, str | Mapping | Scan) or not isinstance(source, Source):
+    from torch.utils.data import IterableDataset  # torch loads slowly
+
+    others = str | Mapping | Scan | IterableDataset
+    if isinstance(source, others) or not isinstance(source, Source):
         raise ConfigError(
             f"{type(source).__name__} as a source of scans",
             "a map-style dataset, with __len__ and __getitem__",

@@ -349,8 +349,8 @@ def _no_labels(given: str, policy: str) -> ConfigError:
     return ConfigError(
         f"{policy} with {given}",
         "real scans with labels, such as SemanticKITTI or a town",
-        f"Give {policy}(real=scans). KITTI-360 and KITTI have no labels: use labels='paste' "
-        "with boxes, or labels='generated'.",
+        f"Give {policy}(real=scans), in YAML real: FOLDER. KITTI-360 and KITTI have no labels: use "
+        "labels='paste' with boxes, or labels='generated'.",
     )
 
 

@@ -168,7 +168,7 @@ def mix(
                     "labelled scans, or synthetic ones alone: ratio=1.0, epoch_size=400",
                     "Then settle the network on the real scans (docs/how-to/mix.md).",
                 )
-    given = {"ratio": ratio, "labels": labels, "as_sensor": as_sensor}
+    given = {"ratio": ratio, "labels": _open_policy(labels), "as_sensor": as_sensor}
     own |= {name: value for name, value in given.items() if value is not None}
     known = dict(inspect.signature(MixedScans).parameters, epochs=0, task=0)
     del known["real_as_is"]
@@ -255,7 +255,21 @@ def mix_for_trainer(
     options = dict(settings)
     synthetic = open_synthetic(options.pop("synthetic"))
     options["as_sensor"] = read_transfer(options.get("as_sensor"), synthetic)
+    if "labels" in options:
+        options["labels"] = _open_policy(options["labels"])
     # Numbers, no samples.
     return MixedScans.wrap(
         range(real), synthetic, to_sample=to_sample, compare=False, **options
     )
+
+
+def _open_policy(labels: Any) -> Any:
+    """A label policy with its real scans, which YAML names by their folder."""
+    if not isinstance(labels, Mapping):
+        return labels
+    return {
+        name: {**given, "real": _open_real(given["real"])}
+        if isinstance(given, Mapping) and "real" in given
+        else given
+        for name, given in labels.items()
+    }

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.lines import Cloud, Model, nearest_beams, residuals
+from lidar_synth.geometry.lines import nearest_beams, residuals
 from lidar_synth.geometry.scan import Scan, Source, spread
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.azimuths import Azimuths, fit_azimuths, turn_of
@@ -16,6 +16,7 @@ from lidar_synth.lab.fitting.beams import NEAREST, Beams, fit_beams, room_of
 from lidar_synth.lab.fitting.doubts import doubts, name_vendor
 from lidar_synth.lab.fitting.limits import range_limits, range_step, reflectance_levels
 from lidar_synth.lab.fitting.lost_beams import add_lost_beams
+from lidar_synth.lab.fitting.model import Cloud, Model
 from lidar_synth.lab.fitting.points import follows_time
 
 Floats = NDArray[np.float64]

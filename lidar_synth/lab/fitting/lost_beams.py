@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.lines import Model, nearest_beams
+from lidar_synth.geometry.lines import nearest_beams
+from lidar_synth.lab.fitting.model import Model
 
 Floats = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.lines import Cloud
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.fitting.model import Cloud
 
 Floats = NDArray[np.float64]
 

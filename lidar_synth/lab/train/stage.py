@@ -116,7 +116,7 @@ class Stage:
 
         Raises:
             ConfigError: on scans that are mirrored or turned, with a condition that cannot be.
-        DataError: on images of another camera than ``condition.focal`` says.
+            DataError: on images of another camera than ``condition.focal`` says.
         """
         given = self.config.data if data is None else data
         sensor = self.header.sensor
