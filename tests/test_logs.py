@@ -253,20 +253,21 @@ def test_plain_files_are_fitted_with_the_options_of_convert(
 ) -> None:
     scan = town_of("velodyne")[0]
     values = np.c_[scan.points, 1999 * scan.reflectance, scan.ring].astype("<f4")
-    values.tofile(tmp_path / "a.bin")
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    values.tofile(scans / "a.bin")
     out = tmp_path / "a.yaml"
-    assert run("sensor", "fit", tmp_path, "--fields", 5, "--out", out) == 1
+    assert run("sensor", "fit", scans, "--fields", 5, "--out", out) == 1
     highest = int(np.ceil(values[:, 3].max()))
     assert f"--reflectance-max {highest}" in capsys.readouterr().err
     given = ("--fields", 5, "--layout", "folder", "--reflectance-max", 1999)
-    assert run("sensor", "fit", tmp_path, *given, "--out", out) == 0
-    assert (
-        run("view", tmp_path, *given, "--sensor", out, "--out", tmp_path / "a.png") == 0
-    )
+    assert run("sensor", "fit", scans, *given, "--out", out) == 0
+    picture = tmp_path / "a.png"
+    assert run("view", scans, *given, "--sensor", out, "--out", picture) == 0
     assert (
         run(
             "convert",
-            tmp_path,
+            scans,
             tmp_path / "out",
             "--to",
             "npz",

@@ -37,7 +37,7 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Generator:
 def test_exchanged_arguments_are_named(generator: Generator) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"Generator as a source of scans.*real scans come first",
+        match=r"Generator as a source of scans.*Real scans come first",
     ):
         MixedScans(generator, Scans("r", 4, GENERATED_SENSOR), 0.5)
 
@@ -288,11 +288,11 @@ def batch_of(sample: Any) -> Any:
             ConfigError,
             r"labels='gessed'; expected one of",
         ),
-        (lambda: mixed(collate="voxels"), ConfigError, "form of batches 'voxels'"),
+        (lambda: mixed(collate="voxels"), ConfigError, "form of batches: 'voxels'"),
         (
             lambda: mixed(unlabelled="skip"),
             ConfigError,
-            r"unlabelled of batches 'skip'",
+            r"unlabelled of batches: 'skip'",
         ),
         (lambda: mixed()[15], IndexError, r"sample 15 of 15"),
         (lambda: mixed().batches(0), ConfigError, r"batch_size 0"),

@@ -153,10 +153,12 @@ class Writer(ABC):
         """Claim the folder by its file ``note``, as ``hold_claim`` does.
 
         Raises:
-            ConfigError: also if this folder is in the source's, or one that is claimed for the
-                first time holds files like those of scans.
+            ConfigError: also if this folder is the source's, or lies in one whose folders are all
+                read, or if it is claimed for the first time and holds files like those of scans.
         """
-        if isinstance(source, ScanFiles):
+        if isinstance(source, ScanFiles) and (
+            source.plain or self.root.resolve() == source.root.resolve()
+        ):
             require_outside(self.root, source.root)
         path = self.root / note
         there = self.root.rglob(f"*{self.path(0).suffix}")

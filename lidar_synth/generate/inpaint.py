@@ -101,8 +101,8 @@ def check_model(generator: Generator, given: Sensor) -> None:
             f"a scan of sensor {given.name!r} ({given.shape[0]} x {given.shape[1]}) for a model of "
             f"{wanted.name!r} ({wanted.shape[0]} x {wanted.shape[1]})",
             "scans on the model's grid",
-            f"Read them so if they fit: --sensor {wanted.name} (sensor=...). Else use no model, or "
-            "one that was trained for this sensor.",
+            f"Read them so if they fit: --sensor {wanted.name} (sensor=...). Else model=None, or "
+            "a model that was trained for this sensor.",
         )
 
 

@@ -407,8 +407,8 @@ class Source(Protocol):
     def __getitem__(self, index: int, /) -> Scan: ...
 
 
-def check_source(source: Any) -> None:
-    """Refuse what gives no scans by number.
+def check_source(source: Any, hint: str = "") -> None:
+    """Refuse what gives no scans by number; ``hint`` is added to the error.
 
     Raises:
         ConfigError: on a path, a dict, a single scan, an ``IterableDataset``, or what has no
@@ -416,13 +416,12 @@ def check_source(source: Any) -> None:
     """
     from torch.utils.data import IterableDataset  # torch loads slowly
 
-    others = str | Mapping | Scan | IterableDataset
-    if isinstance(source, others) or not isinstance(source, Source):
+    by_number = isinstance(source, Source)
+    if isinstance(source, str | Mapping | Scan | IterableDataset) or not by_number:
         raise ConfigError(
             f"{type(source).__name__} as a source of scans",
             "a map-style dataset, with __len__ and __getitem__",
-            "open_scans(path) opens a folder, load_generator('town') a model; real scans come "
-            "first, then synthetic ones.",
+            f"open_scans(path) opens a folder, load_generator('town') a model.{hint}",
         )
 
 
@@ -451,24 +450,33 @@ def identity_of(source: Any) -> str:
 
 
 def require_finite(scan: Scan) -> None:
-    """Check the points of a scan, and that their reflectance is no intensity on another scale;
-    values just above 1 pass.
+    """Check the points of a scan.
 
     Raises:
-        DataError: if some are NaN or infinite, or have another reflectance than 0 to 1.
+        DataError: if some are NaN or infinite.
     """
     if not np.isfinite(scan.points).all():
         raise DataError(
             f"scan {scan.id!r} with points that are NaN or infinite",
-            "finite points",
+            "finite metres",
             "Drop them: scan[np.isfinite(scan.points).all(1)], or on_bad='drop-points' where "
             "scans are read.",
         )
-    if not np.abs(scan.reflectance).max(initial=0) < 1.1:
+
+
+def require_reflectance(scan: Scan) -> None:
+    """Check that the reflectance of a scan is no intensity on another scale; values just above 1
+    pass.
+
+    Raises:
+        DataError: if some are NaN, or not in [0, 1].
+    """
+    given = scan.reflectance
+    if not np.abs(given).max(initial=0) < 1.1:
         raise DataError(
-            f"scan {scan.id!r} with a reflectance up to {scan.reflectance.max():g}",
+            f"scan {scan.id!r} with a reflectance of {given.min():g} to {given.max():g}",
             "0 to 1",
-            "Divide it by its maximum: reflectance_max=255 where scans are read.",
+            "Another scale is divided by its maximum: reflectance_max=255 where scans are read.",
         )
 
 

@@ -64,7 +64,7 @@ class Collate:
     def __post_init__(self) -> None:
         for name, kind in (("form", Form), ("unlabelled", Unlabelled)):
             known = dict.fromkeys(get_args(kind))
-            choose(f"{name} of batches", getattr(self, name), known)
+            choose(f"{name} of batches:", getattr(self, name), known)
         if self.form == "range" and self.sensor is None:
             raise ConfigError(
                 "range images without a sensor", "a sensor, which defines their grid"

@@ -223,10 +223,8 @@ def check_whole(dataset: Any) -> None:
         ConfigError: if a DataLoader's dataset is one, or a ``ConcatDataset`` with one in it.
     """
     if isinstance(dataset, ConcatDataset):
-        for part in dataset.datasets:
-            # The others may be of any data.
-            if hasattr(getattr(part, "dataset", None), "current"):
-                check_whole(part)
+        for part in filter(_is_mixed, dataset.datasets):
+            check_whole(part)
     if isinstance(dataset, Subset):
         raise ConfigError(
             "a Subset of a mixture, of random_split for instance: its indices mean other scans in "
@@ -234,6 +232,14 @@ def check_whole(dataset: Any) -> None:
             "the real scans split, then mixed",
             "kept, held_out = random_split(real, [0.9, 0.1]); train = MixedScans(kept, synth, ...)",
         )
+
+
+def _is_mixed(dataset: Any) -> bool:
+    """Whether a dataset is a mixture, or made of one; others may be split."""
+    parts = getattr(dataset, "datasets", [getattr(dataset, "dataset", None)])
+    if isinstance(dataset, ConcatDataset | Subset):
+        return any(map(_is_mixed, parts))
+    return hasattr(dataset, "tell_sources")
 
 
 def _running_fetcher() -> Any:

@@ -29,8 +29,9 @@ class Item(dict[str, Any]):
 
 
 def copy_scan(scan: Scan) -> Scan:
-    """A scan of which everything but the sensor may be changed in place."""
-    return deepcopy(scan, {id(scan.sensor): scan.sensor})
+    """A scan whose arrays, boxes and pose may be changed in place."""
+    shared = (scan.sensor, scan.provenance, scan.augmented)
+    return deepcopy(scan, {id(part): part for part in shared})
 
 
 def to_item(scan: Scan, rng: np.random.Generator) -> Item:

@@ -41,10 +41,10 @@ class MixedLoader(DataLoader[Any]):
         drop_last: bool = False,
         **options: Any,
     ) -> None:
-        orders = [n for n in ("shuffle", "sampler") if options.get(n)]
-        if orders or not options.get("in_order", True):
+        name = next((n for n in ("shuffle", "sampler") if options.get(n)), "in_order")
+        if name != "in_order" or not options.get(name, True):
             raise ConfigError(
-                f"{[*orders, 'in_order=False'][0]} for a loader of a mixture",
+                f"{name}={options[name]} for a loader of a mixture",
                 "batches in the plan's order, which is shuffled, as state_dict counts them",
             )
         self._mixed = dataset

@@ -167,7 +167,7 @@ class MixedScans(Dataset[Any]):
         if locality not in (None, "shard"):
             raise ConfigError(f"locality={locality!r}", '"shard", or None')
         for source, _ in reals:
-            check_source(source)
+            check_source(source, " Real scans come first, then synthetic ones.")
         synthetics = [
             (make_synthetic(source, seed), weight) for source, weight in each(synth)
         ]

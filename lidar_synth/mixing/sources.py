@@ -66,6 +66,8 @@ class Sources:
 
     def __getitem__(self, index: int) -> Any:
         """The scan at ``index`` of the concatenated sources."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"scan {index} of {len(self)}")
         return ConcatDataset(self.sources)[index]
 
 

@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import RangeImage, Scan, require_finite
+from lidar_synth.geometry.scan import (
+    RangeImage,
+    Scan,
+    require_finite,
+    require_reflectance,
+)
 from lidar_synth.viz.scales import EMPTY, Rgb, Scale, make_scales
 
 CHANNELS = ("range", "reflectance", "label")
@@ -50,6 +55,7 @@ def views(given: Sequence[Scan | RangeImage]) -> list[View]:
     for item in given:
         if isinstance(item, Scan):
             require_finite(item)
+            require_reflectance(item)
     return [
         View(item, project(item, channels=[n for n in CHANNELS if n in item.fields()]))
         if isinstance(item, Scan)

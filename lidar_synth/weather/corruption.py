@@ -18,7 +18,13 @@ from typing_extensions import Self
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.geometry.assign import assign_beams
-from lidar_synth.geometry.scan import CAUSES, Boxes, Scan, require_finite
+from lidar_synth.geometry.scan import (
+    CAUSES,
+    Boxes,
+    Scan,
+    require_finite,
+    require_reflectance,
+)
 
 Values = NDArray[np.float32]
 
@@ -90,6 +96,7 @@ class Corruption(ABC):
             ``change``.
         """
         require_finite(scan)
+        require_reflectance(scan)
         settings = {f.name: getattr(self, f.name) for f in fields(self)[1:]}
         scan = scan.noted(self.name, **settings)
         if not len(scan):

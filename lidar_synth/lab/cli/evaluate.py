@@ -168,14 +168,15 @@ def evaluate(
         open_scans(real, sensor=sensor, **drop_missing(reading)),
         open_scans(fake, sensor=sensor),
     )
-    try:
-        sources[1].load(0)
-    except DataError as error:
-        raise DataError(
-            f"FAKE ({error})",
-            "scans that need no options of reading: those given are of REAL",
-            f"lidar-synth convert {fake} OUT --to npz takes them, too.",
-        ) from error
+    if drop_missing(reading):
+        try:
+            sources[1].load(0)
+        except DataError as error:
+            raise DataError(
+                f"FAKE ({error})",
+                "scans that need no options of reading, as those given are of REAL",
+                f"Convert them first: lidar-synth convert {fake} OUT --to npz.",
+            ) from error
     if not training_data and (note := refuse_training_data(*sources, reading["split"])):
         typer.echo(note, err=True)
     if judge is not None:

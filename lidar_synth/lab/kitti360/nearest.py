@@ -16,12 +16,7 @@ VOXEL = 0.05
 
 _VOTERS = 3
 _NEAR = 0.02  # distance, metres, below which a neighbour weighs no more
-_CUBES = (
-    1 << 17,
-    1 << 17,
-    1 << 14,
-    1 << 8,
-)  # more than there are in x, y, z, and classes
+_CLASSES = 1 << 8
 
 
 class Vote(NamedTuple):
@@ -69,7 +64,7 @@ class NearestLabels:
         A neighbour's weight is its confidence divided by its distance.
 
         Args:
-            points: (N, 3) metres, in the frame of the cloud.
+            points: (N, 3) finite metres, in the frame of the cloud.
             radius: maximum distance of a neighbour, metres.
         """
         found, distance = self.nearest(points, radius, _VOTERS)
@@ -117,8 +112,7 @@ def index_cloud(
 
     Args:
         chunks: the cloud in parts, so that it need not fit into memory.
-        low, high: (3,) corners of the volume, metres; it is at most 800 m high. Points outside are
-            left out.
+        low, high: (3,) corners of the volume, metres. Points outside are left out.
     """
     kept = [
         _thin(
@@ -141,7 +135,7 @@ def _thin(
     confidence: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.float32]]:
     """Points sorted by their cubes and classes, the first of each."""
-    x, y, z = np.floor(points / VOXEL).astype(np.int64).T
-    keys = np.ravel_multi_index((x, y, z, values % _CUBES[3]), _CUBES)
+    places = np.column_stack([points / VOXEL, values % _CLASSES]).astype(np.int64)
+    keys = np.ravel_multi_index(places.T, places.max(axis=0, initial=0) + 1)
     first = np.unique(keys, return_index=True)[1]
     return points[first], values[first], confidence[first]

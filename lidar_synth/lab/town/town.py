@@ -94,7 +94,8 @@ class Town:
         motion: bool = True,
         skin: str | Path | Skin | None = None,
     ) -> None:
-        if seed < 0 or scans < 0 or not 0 < interval < 60:
+        whole = int(seed) == seed >= 0
+        if not whole or scans < 0 or not 0 < interval < 60:
             raise ConfigError(
                 f"a town with seed {seed}, {scans} scans and an interval of {interval} s",
                 "seed >= 0, scans >= 0 and 0 < interval < 60 s",

@@ -21,7 +21,7 @@ from lidar_synth.files.disk import unreadable, unwritable, write_file
 from lidar_synth.files.parsing import read_sealed, seal
 from lidar_synth.files.processes import map_in_processes
 from lidar_synth.lab.train.ranks import ALONE, Ranks
-from lidar_synth.lab.train.resume import flatten
+from lidar_synth.lab.train.resume import flatten, without_wording
 
 Arrays = Mapping[str, NDArray[Any]]
 """{field: the values of one scan, or of all}."""
@@ -167,7 +167,7 @@ def _read_note(folder: Path, facts: dict[str, Any], layout: Layout) -> list[int 
     sums = found.pop("sums", None)
     if FILES in facts:
         found.setdefault(FILES, facts[FILES])
-    old, new = (flatten(_plain(some)) for some in (found, facts))
+    old, new = (flatten(without_wording(some)) for some in (found, facts))
     if differs := [key for key in old | new if old.get(key) != new.get(key)]:
         raise ConfigError(
             f"{folder} is the cache of other data ({', '.join(differs)} differ)",
@@ -179,18 +179,6 @@ def _read_note(folder: Path, facts: dict[str, Any], layout: Layout) -> list[int 
         raise DataError(f"{folder / NOTE} is damaged", f"{count} checksums")
     _open_arrays(folder, layout)
     return sums
-
-
-def _plain(facts: Any) -> Any:
-    """Facts without what is said of a licence, and with whole paths, as they are now."""
-    if isinstance(facts, list):
-        return [_plain(one) for one in facts]
-    if not isinstance(facts, dict):
-        return facts
-    plain = {key: _plain(facts[key]) for key in facts if key != "licence"}
-    if path := plain.get("path"):
-        plain["path"] = os.path.realpath(os.path.expandvars(path))
-    return plain
 
 
 def _check_blocks(

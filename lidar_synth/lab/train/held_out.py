@@ -110,11 +110,16 @@ class Watch:
         since = len(losses) - 1 - losses.index(min(losses))
         return since >= self.held_out.patience
 
+    def is_best(self, training: Training) -> bool:
+        """Whether the averaged weights were measured, and are the best."""
+        last = self.measured[-1] if self.measured else None
+        return last is not None and last[:2] == (training.step, self.least)
+
     def measure(self, training: Training) -> bool:
         """Measure the averaged weights, write the history, and return whether they are the best up
         to now."""
         if self.measured and self.measured[-1].step == training.step:
-            return self.measured[-1].loss == self.least
+            return self.is_best(training)
         loss = self._loss(training)
         best = not self.measured or loss < self.least
         self.measured.append(Measured(training.step, loss, training.seconds))

@@ -1,5 +1,6 @@
 """What a run may be resumed with: the settings that it began with, and more iterations."""
 
+import os
 from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,10 @@ def check_resumed(config: Run) -> None:
         DataError: on a file that is not a state.
     """
     began = read_beginning(config)
-    before = flatten(began.model_dump(mode="json"))
-    now = flatten(config.model_dump(mode="json"))
+    before, now = (
+        flatten(without_wording(some.model_dump(mode="json")))
+        for some in (began, config)
+    )
     if now[MORE] > before[MORE] or _same_steps(config, began.recipe.iterations):
         before[MORE] = now[MORE]
     _refuse_others(config, (before | now).keys() - HARMLESS, before, now)
@@ -152,3 +155,15 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             result[f"{prefix}{key}"] = value
     return result
+
+
+def without_wording(values: Any) -> Any:
+    """Settings without what is said of a licence, and with whole paths, as they are now."""
+    if isinstance(values, list):
+        return [without_wording(one) for one in values]
+    if not isinstance(values, dict):
+        return values
+    plain = {key: without_wording(values[key]) for key in values if key != "licence"}
+    if path := plain.get("path"):
+        plain["path"] = os.path.realpath(os.path.expandvars(path))
+    return plain

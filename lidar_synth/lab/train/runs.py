@@ -338,13 +338,13 @@ class _Keeper:
         ended = self.training.step >= self.config.recipe.iterations
         if path.exists() or not (self.watch or ended):
             return
-        self.save_checkpoint()
-        if not path.exists():
+        if self.watch and not self.watch.is_best(self.training):
             raise ConfigError(
                 f"{path}, which is missing",
                 "the file of this run, which had the best weights on held-out scans",
                 "Put it back, or give another output=FOLDER.",
             )
+        self.save_checkpoint()
 
     @property
     def exhausted(self) -> bool:
