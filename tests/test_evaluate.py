@@ -149,7 +149,9 @@ def test_the_options_of_reading_are_of_the_real_scans(tmp_path: Path) -> None:
     result = CliRunner().invoke(
         app, [*call, "town", "--sensor", "town", "--reflectance-max", "255"]
     )
-    message = r"^FAKE \(.*0\.bin.*options.* of REAL\. Convert.*lidar-synth convert .*fake"
+    message = (
+        r"^FAKE \(.*0\.bin.*options.* of REAL\. Convert.*lidar-synth convert .*fake"
+    )
     assert re.search(message, str(result.exception))
 
 
