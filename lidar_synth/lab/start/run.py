@@ -178,7 +178,7 @@ _RECIPES = {
     "alone, persons and cycles of the town in the place of the model's (gained 7 to 10 mIoU "
     "with 4 labelled frames, 1.5 to 6 with 24, on unseen streets)",
     "detection": "alone for 30 of 40 epochs, then half of each batch, the last two your scans "
-    "alone; your objects pasted into all (gained 28 AP over GT sampling with 4 frames)",
+    "alone; your objects pasted into all (gained 27 AP over GT sampling with 4 frames)",
     "unlabelled": "alone, since your scans lack labels; then settle the network on your scans "
     "(beat 12 labelled frames alone)",
 }
