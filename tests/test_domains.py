@@ -252,7 +252,9 @@ def test_settings_name_the_folder_of_the_real_scans_that_a_policy_mixes_in(
         mixed = mix_for_trainer(4, settings | {"labels": labels})
         return [mixed[i] for i in range(len(mixed)) if mixed.domain(i)]
 
-    for found, wanted in zip(scans(str(tmp_path)), scans(REAL[:1]), strict=True):
+    made = scans(str(tmp_path))
+    assert len(made) == 4
+    for found, wanted in zip(made, scans(REAL[:1]), strict=True):
         assert np.array_equal(found.points, wanted.points)
 
 

@@ -161,7 +161,13 @@ def test_a_part_of_a_mixture_is_refused_and_a_part_of_its_real_scans_stays_apart
 ) -> None:
     train = mixed()
     part, other = random_split(train, [0.8, 0.2])
-    for dataset in (part, ConcatDataset([train, other])):
+    nested = Subset(ConcatDataset([train, train]), [0])
+    for dataset in (
+        part,
+        ConcatDataset([train, other]),
+        ConcatDataset([ConcatDataset([other, train]), train]),
+        ConcatDataset([nested, train]),
+    ):
         refused(
             iter(DataLoader(dataset, 4, collate_fn=list, num_workers=workers)),
             r"random_split\(real, \[0.9, 0.1\]\)",

@@ -6,6 +6,7 @@ import os
 import pickle
 import warnings
 from collections.abc import Iterator
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -247,6 +248,14 @@ def test_a_sample_that_is_changed_in_place_changes_no_scan(by: str) -> None:
     for i in range(len(train)):
         train[i]
     assert before == pickle.dumps((real, kept))
+
+
+def test_a_provenance_that_cannot_be_copied_is_shared() -> None:
+    real = Scans("r", 2)
+    for scan in real:
+        scan.provenance = MappingProxyType({"model": "theirs"})
+    train = MixedScans(real, ratio=0, to_sample=lambda scan, rng: scan)
+    assert all(train[i].provenance == {"model": "theirs"} for i in range(2))
 
 
 def test_wrap_returns_samples_of_the_wrapped_dataset_unchanged() -> None:

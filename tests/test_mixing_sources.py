@@ -295,6 +295,7 @@ def batch_of(sample: Any) -> Any:
             r"unlabelled of batches: 'skip'",
         ),
         (lambda: mixed()[15], IndexError, r"sample 15 of 15"),
+        (lambda: Sources(Scans("r", 4))[-1], IndexError, r"scan -1 of 4"),
         (lambda: mixed().batches(0), ConfigError, r"batch_size 0"),
         (lambda: mixed().batches(2, rank=2, world_size=2), ConfigError, r"rank 2 of 2"),
         (lambda: mixed().batches(2, rank=1), ConfigError, r"rank 1 of None"),

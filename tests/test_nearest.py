@@ -80,6 +80,13 @@ def test_points_outside_the_volume_and_nan_are_left_out() -> None:
     assert len(index) == 1
 
 
+def test_a_volume_may_be_of_any_size() -> None:
+    far = np.array([[9000.0, 1, 900]])
+    one = [(far, np.ones(1, np.uint32), np.ones(1, np.float32))]
+    index = index_cloud(one, LOW, np.full(3, 1e4))
+    assert index.vote(far, 0.1).value.tolist() == [1]
+
+
 def test_an_empty_cloud_labels_nothing() -> None:
     for index in (index_cloud([], LOW, HIGH), cloud(0)):
         vote = index.vote(np.ones((3, 3)), 0.5)

@@ -20,7 +20,8 @@ from pandaset_files import (
 
 from lidar_synth.datasets.classes import IGNORE, NAMES, PANDASET
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.formats import PandaSet, open_scans
+from lidar_synth.formats import WRITERS, PandaSet, open_scans
+from lidar_synth.formats.convert import convert
 from lidar_synth.formats.pandaset import CAMERAS
 from lidar_synth.formats.pandaset_cuboids import BOXES
 from lidar_synth.geometry.sensor import load_sensor
@@ -253,6 +254,15 @@ def test_sequences_and_cameras_are_chosen(tmp_path: Path) -> None:
     assert back[0].image_path == image
     with pytest.raises(DataError, match="holds no scan; expected PandaSet's sequences"):
         PandaSet(tmp_path / "007" / "camera")
+
+
+def test_scans_of_a_sequence_are_written_beside_it(tmp_path: Path) -> None:
+    write_pandaset(tmp_path, 2)
+    [sequence] = [path for path in tmp_path.iterdir() if path.is_dir()]
+    report = convert(
+        PandaSet(sequence), WRITERS["npz"](tmp_path / "out"), progress=False
+    )
+    assert report.written == 2
 
 
 def test_a_sequence_without_labels(tmp_path: Path) -> None:

@@ -431,10 +431,14 @@ def test_a_selection_of_other_settings_is_refused(
     assert (run / "config.yaml").read_bytes() == before
 
 
-def test_a_run_is_resumed_with_another_licence(scans: Path, tmp_path: Path) -> None:
+def test_a_run_is_resumed_with_another_licence_and_spelling_of_a_path(
+    scans: Path, tmp_path: Path
+) -> None:
     config = write_config(scans, tmp_path)
     call("train", config, "--minutes", "0")
-    call("train", config, "--resume", "licence=MIT-0", "data.licence=MIT-0")
+    same = scans / ".." / scans.name / "scans"
+    given = ("licence=MIT-0", "data.licence=MIT-0", f"data.path={same}")
+    call("train", config, "--resume", *given)
     facts = read_header(tmp_path / "run" / "run.safetensors")[0].provenance
     assert facts["licence"] == facts["data_licence"] == "MIT-0"
 

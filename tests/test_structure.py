@@ -206,7 +206,7 @@ def test_what_only_the_laboratory_imports_is_part_of_it() -> None:
 
 LIMITS = {
     "plugin": (169_050, 5.95, 130),
-    "laboratory": (139_390, 6.03, 130),
+    "laboratory": (139_350, 6.03, 130),
     "tools": (38_450, 5.8, 130),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when

@@ -1,6 +1,7 @@
 """Runs that are disturbed: caches that two of them open, failures while saving, patience that ends
 before the rate falls, and starts that contradict the configuration."""
 
+import json
 import os
 from contextlib import nullcontext
 from pathlib import Path
@@ -23,6 +24,7 @@ from lidar_synth.lab.train import (
     run,
     runs,
 )
+from lidar_synth.lab.train.held_out import HISTORY, read_history
 from lidar_synth.lab.train.schedules import PLATEAU
 from lidar_synth.lab.train.staged import train_for
 from lidar_synth.lab.train.start import open_networks
@@ -104,6 +106,17 @@ def test_removed_weights_that_were_better_than_the_last_are_missed(
     run(given).unlink()
     with pytest.raises(ConfigError, match="run.safetensors, which is missing; exp"):
         run(given, resume=True)
+
+
+def test_a_run_that_is_refused_is_not_measured(tmp_path: Path) -> None:
+    given = config(tmp_path / "run", "recipe.iterations=4", HELD)
+    run(given, minutes=0).unlink()
+    # As after Ctrl-C, when the last weights are not measured.
+    history = read_history(tmp_path / "run")[:1]
+    (tmp_path / "run" / HISTORY).write_text(json.dumps(history))
+    with pytest.raises(ConfigError, match="run.safetensors, which is missing; exp"):
+        run(given, resume=True)
+    assert read_history(tmp_path / "run") == history
 
 
 @pytest.mark.slow

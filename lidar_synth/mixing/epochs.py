@@ -236,9 +236,10 @@ def check_whole(dataset: Any) -> None:
 
 def _is_mixed(dataset: Any) -> bool:
     """Whether a dataset is a mixture, or made of one; others may be split."""
-    parts = getattr(dataset, "datasets", [getattr(dataset, "dataset", None)])
-    if isinstance(dataset, ConcatDataset | Subset):
-        return any(map(_is_mixed, parts))
+    if isinstance(dataset, Subset):
+        return _is_mixed(dataset.dataset)
+    if isinstance(dataset, ConcatDataset):
+        return any(map(_is_mixed, dataset.datasets))
     return hasattr(dataset, "tell_sources")
 
 

@@ -164,11 +164,12 @@ def evaluate(
                 raise typer.BadParameter(f"goes with {needed}", param_hint=option)
     if protocol is not None:
         rules = choose("--protocol", protocol, PROTOCOLS)
+    given_for_real = drop_missing(reading)
     sources = (
-        open_scans(real, sensor=sensor, **drop_missing(reading)),
+        open_scans(real, sensor=sensor, **given_for_real),
         open_scans(fake, sensor=sensor),
     )
-    if drop_missing(reading):
+    if given_for_real:
         try:
             sources[1].load(0)
         except DataError as error:

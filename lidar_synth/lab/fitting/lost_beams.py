@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.lines import nearest_beams
+from lidar_synth.geometry.lines import Floats, nearest_beams
 from lidar_synth.lab.fitting.model import Model
-
-Floats = NDArray[np.float64]
 
 STRAY = np.radians(0.06)
 """Points farther than this from all beams may be those of a lost one."""

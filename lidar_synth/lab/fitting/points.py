@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.lines import Floats
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import Scan, require_finite
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.model import Cloud
-
-Floats = NDArray[np.float64]
 
 ONE_TURN = (0.7, 1.3)
 """Turns by which the azimuth changes from the first to the last point of a file in the order of
@@ -28,14 +27,9 @@ def gather(scans: Sequence[Scan]) -> Cloud:
     """
     if not scans:
         raise DataError("no scans", "at least one scan to fit a sensor to")
+    for scan in scans:
+        require_finite(scan)
     points = np.concatenate([scan.points for scan in scans]).astype(np.float64)
-    if not np.isfinite(points).all():
-        bad = next(scan.id for scan in scans if not np.isfinite(scan.points).all())
-        raise DataError(
-            f"scan {bad!r} with NaN or infinite points",
-            "finite metres",
-            "Read it with on_bad='drop-points'.",
-        )
     number = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
     timed = all(scan.time is not None for scan in scans)
     times = [
