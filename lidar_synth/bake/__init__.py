@@ -17,7 +17,7 @@ _HOME = {
     "BakeJob": "options",
     "BakePlan": "job",
     "Resources": "resources",
-    "Share": "run",
+    "Share": "share",
     "bake": "run",
     "bake_shard": "shard",
     "make_plan": "job",
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from lidar_synth.bake.options import BakeJob as BakeJob
     from lidar_synth.bake.resources import Resources as Resources
     from lidar_synth.bake.run import ENGINES as ENGINES
-    from lidar_synth.bake.run import Share as Share
     from lidar_synth.bake.run import bake as bake
     from lidar_synth.bake.shard import bake_shard as bake_shard
+    from lidar_synth.bake.share import Share as Share
 
 
 def __getattr__(name: str) -> Any:

@@ -8,7 +8,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 from tqdm import tqdm
 
@@ -18,10 +17,11 @@ from lidar_synth.bake.processes import bake_in_processes
 from lidar_synth.bake.ray_actors import bake_on_ray
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
+from lidar_synth.bake.share import Share
 from lidar_synth.bake.slurm import bake_on_slurm
 from lidar_synth.bake.torchrun import take_part
 from lidar_synth.bank import Index
-from lidar_synth.errors import ConfigError, choose
+from lidar_synth.errors import choose
 from lidar_synth.generate.devices import check_device
 
 Engine = Callable[[BakePlan, Sequence[int], Resources, Progress], None]
@@ -43,29 +43,6 @@ ENGINES: dict[str, Engine] = {
     "torchrun": bake_local,  # its part of the shards
 }
 """Engines by name; each of them runs ``bake_shard``."""
-
-
-@dataclass(frozen=True)
-class Share:
-    """Every n-th shard, for independent runs that share the work.
-
-    Args:
-        index: position of the first shard, 0 <= index < of.
-        of: number of shares.
-
-    Raises:
-        ConfigError: on an index outside this interval.
-    """
-
-    index: int = 0
-    of: int = 1
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.index < self.of:
-            raise ConfigError(
-                f"--shard-index {self.index} of --num-shards {self.of}",
-                "0 <= index < number",
-            )
 
 
 def bake(

@@ -7,19 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidar_synth.bake.options import BakeJob
-from lidar_synth.cli.options import options_from
+from lidar_synth.cli.options import drop_missing, options_from
 
 if TYPE_CHECKING:
     from lidar_synth.bake import BakePlan, Resources, Share
-
-# The index and the size of an array job; a Kubernetes Indexed Job does not tell its size.
-_ARRAYS = {
-    "JOB_COMPLETION_INDEX": "",
-    "AWS_BATCH_JOB_ARRAY_INDEX": "AWS_BATCH_JOB_ARRAY_SIZE",
-    "SLURM_ARRAY_TASK_ID": "SLURM_ARRAY_TASK_COUNT",
-    "CLOUD_RUN_TASK_INDEX": "CLOUD_RUN_TASK_COUNT",
-    "SKYPILOT_NODE_RANK": "SKYPILOT_NUM_NODES",
-}
 
 
 @options_from(BakeJob, after="config")
@@ -96,91 +87,28 @@ def bake(
       torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 \\
           --device cuda --engine torchrun
     """
-    from lidar_synth.bake import ENGINES, make_plan
-    from lidar_synth.bake import bake as run
-    from lidar_synth.bake.folder import check_settings
-    from lidar_synth.errors import choose
-    from lidar_synth.files.recipes import find_recipe, read_recipe, validate
+    from lidar_synth.bake.share import read_share
 
-    values = {} if config is None else read_recipe(find_recipe(config))
-    values |= {name: value for name, value in settings.items() if value is not None}
-    share = _share(shard_index, num_shards)
-    plan = make_plan(
-        out, validate(BakeJob, values, "bake" if config is None else str(config))
-    )
+    share = read_share(shard_index, num_shards)
+    plan = _plan(out, config, drop_missing(settings))
     resources = _resources(plan, workers, address, slurm)
     engine = engine or (
         "slurm" if slurm else "ray" if address else "processes" if workers else "local"
     )
     if dry_run:
-        choose("engine", engine, ENGINES)
-        _describe(check_settings(plan))
-        return
-    first = os.environ.get("LOCAL_RANK", "0") == "0"
-    try:
-        index = run(plan, engine, resources, share, progress=first)
-    except KeyboardInterrupt:
-        typer.echo(
-            f"stopped; finished shards are kept in {out}, the same command resumes",
-            err=True,
-        )
-        raise typer.Exit(130) from None
-    if index is None:
-        typer.echo(
-            f"{out}: this share is finished; the last of all {len(plan.shards)} shards completes "
-            "the bank"
-        )
+        _describe(plan, engine)
     else:
-        typer.echo(
-            f"{out}: {index.scans} scans in {len(index.shards)} shards, {index.size / 1e6:.3g} MB"
-        )
-        _report_unboxed(out)
+        _run(out, plan, engine, resources, share)
 
 
-def _share(index: str, number: int | None) -> "Share":
-    """The shards of this run, with 'auto' by the environment of an array job."""
-    from lidar_synth.bake import Share
-    from lidar_synth.errors import ConfigError
+def _plan(out: str, config: Path | None, given: dict[str, Any]) -> "BakePlan":
+    """The plan of the settings in a file and of those given, which take precedence."""
+    from lidar_synth.bake import make_plan
+    from lidar_synth.files.recipes import find_recipe, read_recipe, validate
 
-    size = "1" if number is None else str(number)
-    if index == "auto":
-        found = [name for name in _ARRAYS if name in os.environ]
-        if not found:
-            raise ConfigError(
-                "--shard-index auto outside an array job",
-                f"one of {', '.join(_ARRAYS)}",
-            )
-        index = os.environ[found[0]]
-        if number is None:
-            size = os.environ.get(_ARRAYS[found[0]], "")
-            last = int(os.environ.get("SLURM_ARRAY_TASK_MAX", "-1"))
-            if size.isdigit() and last >= int(size):
-                raise ConfigError(
-                    f"a Slurm array of {size} tasks up to {last}",
-                    "tasks from 0 without gaps, such as --array=0-15",
-                    "For a part of them, give --num-shards as well.",
-                )
-    if not (index.isdigit() and size.lstrip("-").isdigit()):
-        raise ConfigError(
-            f"--shard-index {index!r} of --num-shards {size!r}",
-            "two whole numbers",
-            "--shard-index auto --num-shards 16",
-        )
-    return Share(int(index), int(size))
-
-
-def _report_unboxed(bank: str) -> None:
-    """Print how many objects of the first scans have no box, for those who train a detector."""
-    from lidar_synth.bank import Bank
-    from lidar_synth.labels.edit import measure
-
-    opened = Bank(bank)
-    found = measure(opened[i] for i in range(min(8, len(opened))))
-    if found.objects:
-        typer.echo(
-            f"  {found}; a detector needs labels: paste, which removes them and pastes "
-            "objects with boxes"
-        )
+    values = {} if config is None else read_recipe(find_recipe(config))
+    where = "bake" if config is None else str(config)
+    return make_plan(out, validate(BakeJob, values | given, where))
 
 
 def _resources(
@@ -206,10 +134,57 @@ def _resources(
     return Resources(workers, address, options)
 
 
-def _describe(plan: "BakePlan") -> None:
-    """Print what a bake would write; the time and size are estimated from a few scans."""
-    from lidar_synth.bake.estimate import estimate
+def _run(
+    out: str, plan: "BakePlan", engine: str, resources: "Resources", share: "Share"
+) -> None:
+    """Bake, and print what there is now."""
+    from lidar_synth.bake import bake
 
+    first = os.environ.get("LOCAL_RANK", "0") == "0"
+    try:
+        index = bake(plan, engine, resources, share, progress=first)
+    except KeyboardInterrupt:
+        typer.echo(
+            f"stopped; finished shards are kept in {out}, the same command resumes",
+            err=True,
+        )
+        raise typer.Exit(130) from None
+    if index is None:
+        typer.echo(
+            f"{out}: this share is finished; the last of all {len(plan.shards)} shards "
+            "completes the bank"
+        )
+    else:
+        typer.echo(
+            f"{out}: {index.scans} scans in {len(index.shards)} shards, "
+            f"{index.size / 1e6:.3g} MB"
+        )
+        _report_unboxed(out)
+
+
+def _report_unboxed(bank: str) -> None:
+    """Print how many objects of the first scans have no box, for those who train a detector."""
+    from lidar_synth.bank import Bank
+    from lidar_synth.labels.edit import measure
+
+    opened = Bank(bank)
+    found = measure(opened[i] for i in range(min(8, len(opened))))
+    if found.objects:
+        typer.echo(
+            f"  {found}; a detector needs labels: paste, which removes them and pastes "
+            "objects with boxes"
+        )
+
+
+def _describe(plan: "BakePlan", engine: str) -> None:
+    """Print what a bake would write; the time and size are estimated from a few scans."""
+    from lidar_synth.bake import ENGINES
+    from lidar_synth.bake.estimate import estimate
+    from lidar_synth.bake.folder import check_settings
+    from lidar_synth.errors import choose
+
+    choose("engine", engine, ENGINES)
+    plan = check_settings(plan)
     job = plan.job
     shards = plan.shards
     expected = estimate(plan)

@@ -1,17 +1,10 @@
 """``lidar-synth sample``: generates scans with a model."""
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from lidar_synth.cli.options import Format, Out
-from lidar_synth.datasets.recordings import NOTE, seen_by
-
-if TYPE_CHECKING:
-    from lidar_synth.bake.conditions import ConditionSource
-    from lidar_synth.generate.generator import Generator
-    from lidar_synth.geometry.scan import Scan
 
 
 def sample(
@@ -93,73 +86,38 @@ def sample(
           --condition-split val
       lidar-synth sample out --model town-layout --condition behind_a_van.yaml
     """
-    import torch
-
-    from lidar_synth.bake.conditions import conditions_for, fingerprint, settle_objects
+    from lidar_synth.bake.conditions import conditions_for, settle_objects
+    from lidar_synth.bake.job import DTYPES
+    from lidar_synth.bake.samples import Samples
     from lidar_synth.errors import choose
     from lidar_synth.formats import WRITERS
     from lidar_synth.generate.flow.solvers import read_grid
     from lidar_synth.generate.loading import load_generator
 
     writer = choose("--to", to, WRITERS)(out)
-    precision = choose(
-        "dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16}
-    )
+    precision = choose("dtype", dtype, DTYPES)
     generator = load_generator(
         model, device=device, dtype=precision, batch=batch, columns=columns
     )
-    given = conditions_for(generator, condition, condition_layout, condition_split)
-    sampling: dict[str, Any] = {
-        "steps": steps,
-        "times": None if times is None else read_grid(times.split(",")),
-        "solver": solver,
-        "guidance": guidance,
-    }
-    chosen = settle_objects(generator, objects)
-    provenance = generator.header.provenance
-    settings = sampling | {
-        "checkpoint": generator.hash,
-        "seed": seed,
+    samples = Samples(
+        generator,
+        seed,
+        conditions_for(generator, condition, condition_layout, condition_split),
+        settle_objects(generator, objects),
+        {
+            "steps": steps,
+            "times": None if times is None else read_grid(times.split(",")),
+            "solver": solver,
+            "guidance": guidance,
+        },
+    )
+    asked = {
         "dtype": dtype,
         "to": to,
         "condition": condition,
         "condition_layout": condition_layout,
         "condition_split": condition_split,
-        "conditions": fingerprint(given),
         "columns": columns,
-        "objects": chosen,
-        "trained_on": provenance["data"],
-        "seen": seen_by(provenance).to_list(),
     }
-    with writer.hold(NOTE, settings):
-        missing = [i for i in range(count) if not writer.complete(i)]
-        for index, scan in _generate(generator, seed, missing, given, chosen, sampling):
-            writer.write(scan, index)
-        writer.finish()
-    typer.echo(
-        f"{out}: {len(missing)} scans written, {count - len(missing)} were there already"
-    )
-
-
-def _generate(
-    generator: "Generator",
-    seed: int,
-    numbers: Sequence[int],
-    given: "ConditionSource | None",
-    objects: str | None,
-    sampling: dict[str, Any],
-) -> "Iterator[tuple[int, Scan]]":
-    """The numbers and their scans, with a progress bar."""
-    from tqdm import tqdm
-
-    from lidar_synth.bake.conditions import conditions, open_objects
-
-    with tqdm(total=len(numbers), desc="scans", unit="scan") as bar:
-        for first in range(0, len(numbers), generator.batch):
-            batch = numbers[first : first + generator.batch]
-            cast = open_objects(objects, generator.sensor)
-            scans = generator.scans(
-                seed, batch, conditions(given, batch), cast, **sampling
-            )
-            yield from zip(batch, scans, strict=True)
-            bar.update(len(batch))
+    written = samples.write(writer, count, asked)
+    typer.echo(f"{out}: {written} scans written, {count - written} were there already")
