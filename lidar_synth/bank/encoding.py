@@ -30,6 +30,8 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
 
+_compiled = numba.njit(nogil=True, cache=True)
+
 RANGE_STEPS = 65535
 """Steps of the range from 0 to the sensor's range_max."""
 
@@ -223,7 +225,7 @@ def _train_ids(label: NDArray[Any]) -> NDArray[np.uint8]:
     return label.astype(np.uint8)
 
 
-@numba.njit(nogil=True, cache=True)
+@_compiled
 def _encode_range(metres, inverse, near, far, out):  # type: ignore[no-untyped-def]
     """Steps of 1 / inverse metres, of (N,) float32; False where a range is outside near to far and
     not 0."""
@@ -240,7 +242,7 @@ def _encode_range(metres, inverse, near, far, out):  # type: ignore[no-untyped-d
     return sound
 
 
-@numba.njit(nogil=True, cache=True)
+@_compiled
 def _decode_range(codes, scale, near, far, out):  # type: ignore[no-untyped-def]
     """The inverse of ``_encode_range``, clipped to near..far."""
     for i in range(len(codes)):
@@ -251,7 +253,7 @@ def _decode_range(codes, scale, near, far, out):  # type: ignore[no-untyped-def]
         )
 
 
-@numba.njit(nogil=True, cache=True)
+@_compiled
 def _encode_shares(values, levels, out):  # type: ignore[no-untyped-def]
     """Steps of 1 / levels; False where a value is outside 0 to 1."""
     sound = True
@@ -261,7 +263,7 @@ def _encode_shares(values, levels, out):  # type: ignore[no-untyped-def]
     return sound
 
 
-@numba.njit(nogil=True, cache=True)
+@_compiled
 def _decode_shares(codes, levels, out):  # type: ignore[no-untyped-def]
     """The inverse of ``_encode_shares``."""
     for i in range(len(codes)):

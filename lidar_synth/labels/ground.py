@@ -11,6 +11,8 @@ from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import box_frame
 
+_compiled = numba.njit(cache=True)
+
 LEAST = 5
 """Minimum number of returns of a plane."""
 ROUGH = 0.15
@@ -110,7 +112,7 @@ def standing(scan: Scan, boxes: Boxes) -> NDArray[np.bool_]:
     return inside & ~low
 
 
-@numba.njit(cache=True)
+@_compiled
 def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-def]
     """Fit the ground: (whether there is any, rise along, rise across, height at the centre, number
     of directions with ground returns, whether the box is free)."""
@@ -147,7 +149,7 @@ def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-d
     return True, along, across, height, _sides(local, ground), free
 
 
-@numba.njit(cache=True)
+@_compiled
 def _around(points, box, reach):  # type: ignore[no-untyped-def]
     """Indices (n,) of the points within reach of the box, and their coordinates (n, 3) float64:
     along and across the box, and above the sensor."""
@@ -172,7 +174,7 @@ def _around(points, box, reach):  # type: ignore[no-untyped-def]
     return near[:count], local[:count]
 
 
-@numba.njit(cache=True)
+@_compiled
 def _third_lowest(local):  # type: ignore[no-untyped-def]
     """The third lowest height, because up to two stray returns may lie below the ground."""
     first = np.inf
@@ -189,7 +191,7 @@ def _third_lowest(local):  # type: ignore[no-untyped-def]
     return third
 
 
-@numba.njit(cache=True)
+@_compiled
 def _sides(local, ground):  # type: ignore[no-untyped-def]
     """Number of directions from the centre in which there is ground."""
     count = 0
@@ -203,7 +205,7 @@ def _sides(local, ground):  # type: ignore[no-untyped-def]
     return count
 
 
-@numba.njit(cache=True)
+@_compiled
 def _plane(local, ground, box):  # type: ignore[no-untyped-def]
     """Weighted least squares: near returns weigh more, and regularisation makes a plane of few
     returns level."""

@@ -14,6 +14,8 @@ from lidar_synth.geometry.layout.layout import (
 )
 from lidar_synth.geometry.sensor import Sensor
 
+_compiled = numba.njit(cache=True)
+
 FARTHEST = 65535 * DEPTH_STEP
 """The largest depth that two bytes hold, metres."""
 
@@ -87,7 +89,7 @@ def _walls(layout: Layout) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     return np.concatenate(walls), np.array(kinds, np.uint8)
 
 
-@numba.njit(cache=True)
+@_compiled
 def _cast(  # type: ignore[no-untyped-def]
     azimuth, slope, lift, boxes, codes, walls, kinds, ground, reach, nearest, farthest
 ):
@@ -147,7 +149,7 @@ def _cast(  # type: ignore[no-untyped-def]
     return code, depth, chord, along
 
 
-@numba.njit(cache=True)
+@_compiled
 def _between(offset, slope, half, enter, leave):  # type: ignore[no-untyped-def]
     """The part of ``enter`` to ``leave`` in which |offset + slope * rho| <= half; empty parts have
     enter >= leave."""
@@ -158,7 +160,7 @@ def _between(offset, slope, half, enter, leave):  # type: ignore[no-untyped-def]
     return max(enter, min(a, b)), min(leave, max(a, b))
 
 
-@numba.njit(cache=True)
+@_compiled
 def _cross_boxes(dx, dy, boxes, which, span):  # type: ignore[no-untyped-def]
     """Fill the boxes whose footprint a direction crosses, and from where to where; return their
     number."""
@@ -179,7 +181,7 @@ def _cross_boxes(dx, dy, boxes, which, span):  # type: ignore[no-untyped-def]
     return count
 
 
-@numba.njit(cache=True)
+@_compiled
 def _cross_walls(dx, dy, walls, which, at):  # type: ignore[no-untyped-def]
     """Fill the walls that a direction crosses, and their distance, lower and upper edge there;
     return their number."""

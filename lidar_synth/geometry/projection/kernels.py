@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
 
+_compiled = numba.njit(error_model="numpy", cache=True)
+_inlined = numba.njit(inline="always")
+
 MARGIN = 1e-6
 """Part of the range limits by which a point may lie beyond them: the rounding error of float32
 points, so that a return at a limit is kept when it is projected again."""
@@ -98,7 +101,7 @@ def grid_of(sensor: Sensor) -> Grid:
     return Grid(up, down, edges, slopes, lifts, starts, *sensor.shape, near, far)
 
 
-@numba.njit(inline="always")
+@_inlined
 def atan2(y, x):  # type: ignore[no-untyped-def]  # float32 scalars, compiled
     """Angle of (x, y) in [-pi, pi], radians, float32."""
     ax = abs(x)
@@ -116,7 +119,7 @@ def atan2(y, x):  # type: ignore[no-untyped-def]  # float32 scalars, compiled
     return -a if y < _ZERO else a
 
 
-@numba.njit(inline="always")
+@_inlined
 def asin(s):  # type: ignore[no-untyped-def]  # float32 scalars, compiled
     """Arc sine of s in [-1, 1], radians, float32."""
     a = abs(s)
@@ -128,14 +131,14 @@ def asin(s):  # type: ignore[no-untyped-def]  # float32 scalars, compiled
     return -a if s < _ZERO else a
 
 
-@numba.njit(inline="always")
+@_inlined
 def column_of(azimuth, columns):  # type: ignore[no-untyped-def]
     """Column of an azimuth (radians, clockwise); +pi wraps to column 0."""
     column = np.int32((azimuth / PI + _ONE) * _HALF * _f(columns))
     return np.int32(0) if column >= columns else column
 
 
-@numba.njit(inline="always")
+@_inlined
 def row_of(elevation, up, down, rows):  # type: ignore[no-untyped-def]
     """Row of an elevation (radians) where rows are linear; the first or last row outside the field
     of view."""
@@ -143,7 +146,7 @@ def row_of(elevation, up, down, rows):  # type: ignore[no-untyped-def]
     return np.int32(min(max(row, _ZERO), _f(rows) - _ONE))
 
 
-@numba.njit(inline="always")
+@_inlined
 def row_in_table(elevation, edges):  # type: ignore[no-untyped-def]
     """Row of an elevation (radians) between tabulated edges; the first or last row outside the
     field of view."""
@@ -158,7 +161,7 @@ def row_in_table(elevation, edges):  # type: ignore[no-untyped-def]
     return np.int32(low - 1)
 
 
-@numba.njit(inline="always")
+@_inlined
 def row_of_lasers(z, flat, slopes, lifts):  # type: ignore[no-untyped-def]
     """Row of a point at height z and horizontal distance ``flat`` (metres) between edges that start
     above the origin; the first or last row outside the field of view."""
@@ -173,7 +176,7 @@ def row_of_lasers(z, flat, slopes, lifts):  # type: ignore[no-untyped-def]
     return np.int32(low - 1)
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def _locate_block(x, y, z, grid, cell, distance):  # type: ignore[no-untyped-def]
     """Cells and ranges of one block of points; outside the range limits: cell 0, range inf."""
     up = grid.up
@@ -234,7 +237,7 @@ def _mark_empty(image, index):  # type: ignore[no-untyped-def]
             index[c] = -1
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def nearest_points(points, grid, image, index):  # type: ignore[no-untyped-def]
     """Fill ``image`` (H*W,) with the smallest range per cell (0 = none) and ``index`` with its
     point (-1 = none)."""
@@ -255,7 +258,7 @@ def nearest_points(points, grid, image, index):  # type: ignore[no-untyped-def]
     _mark_empty(image, index)
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def nearest_in_cells(cell, distance, image, index):  # type: ignore[no-untyped-def]
     """``nearest_points`` for points with given cells (N,), -1 = none."""
     image[:] = _INF
@@ -265,7 +268,7 @@ def nearest_in_cells(cell, distance, image, index):  # type: ignore[no-untyped-d
     _mark_empty(image, index)
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def locate_points(points, grid, cell, distance):  # type: ignore[no-untyped-def]
     """Fill ``cell`` (N,) with the cell of each point (-1 outside the range limits) and ``distance``
     with its range."""
@@ -279,13 +282,13 @@ def locate_points(points, grid, cell, distance):  # type: ignore[no-untyped-def]
             distance[i] = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def gather(values, index, empty, out):  # type: ignore[no-untyped-def]
     for c in range(len(index)):
         out[c] = values[index[c]] if index[c] >= 0 else empty
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def returns_in(image):  # type: ignore[no-untyped-def]
     """Number of cells of ``image`` (H*W,) with a return; -1 if any range is negative or not
     finite."""
@@ -302,7 +305,7 @@ def returns_in(image):  # type: ignore[no-untyped-def]
 # there are returns.
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def along_rays(image, directions, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (N + 1, 3) with the points of the N returns in ``image`` (H*W,) along
     ``directions`` (H*W, 3)."""
@@ -329,7 +332,7 @@ def pick_returns(image, values, out):  # type: ignore[no-untyped-def]
         n += image[c] > 0
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def put_in_rows(cell, rows, columns):  # type: ignore[no-untyped-def]
     """Move each point with a cell (N,) to the row (N,) of its laser, in place."""
     for i in range(len(cell)):
@@ -337,7 +340,7 @@ def put_in_rows(cell, rows, columns):  # type: ignore[no-untyped-def]
             cell[i] = rows[i] * columns + cell[i] % columns
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def turns_of(points, azimuth, flat):  # type: ignore[no-untyped-def]
     """Fill ``azimuth`` (N,) with radians counter-clockwise from straight ahead, in [0, 2 pi], and
     ``flat`` (N,) with the horizontal distance."""
@@ -349,7 +352,7 @@ def turns_of(points, azimuth, flat):  # type: ignore[no-untyped-def]
         flat[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def elevations_from(points, height, elevation):  # type: ignore[no-untyped-def]
     """Fill ``elevation`` (N,) with radians above the horizon, seen from ``height`` metres above the
     origin."""
@@ -360,7 +363,7 @@ def elevations_from(points, height, elevation):  # type: ignore[no-untyped-def]
         elevation[i] = atan2(z[i] - height, np.sqrt(x[i] * x[i] + y[i] * y[i]))
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def count_octants(points, counts):  # type: ignore[no-untyped-def]
     """Count the points (N, 3) of each of eight equal sectors of azimuth in ``counts`` (8,), in any
     order."""
@@ -370,7 +373,7 @@ def count_octants(points, counts):  # type: ignore[no-untyped-def]
         counts[4 * (x < _ZERO) + 2 * (y < _ZERO) + (abs(x) < abs(y))] += 1
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def _median(values, start, end, few):  # type: ignore[no-untyped-def]
     """The median of a few values; ``few`` is a buffer for them."""
     n = end - start
@@ -384,7 +387,7 @@ def _median(values, start, end, few):  # type: ignore[no-untyped-def]
     return (few[(n - 1) // 2] + few[n // 2]) * _HALF
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def steps_at(values, places, width, steps):  # type: ignore[no-untyped-def]
     """Fill ``steps`` (K,) with the median of ``width`` values (N,) before each place less that of
     those from it on."""
@@ -395,7 +398,7 @@ def steps_at(values, places, width, steps):  # type: ignore[no-untyped-def]
         steps[k] = before - _median(values, i, min(i + width, len(values)), few)
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def decreases(azimuth, flat, least, motion, places, limits):  # type: ignore[no-untyped-def]
     """Find the points whose azimuth (N,) decreases by more than ``least`` and a shift of ``motion``
     metres of both.
@@ -417,7 +420,7 @@ def decreases(azimuth, flat, least, motion, places, limits):  # type: ignore[no-
     return found
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def sines_of(points, sine):  # type: ignore[no-untyped-def]
     """Fill ``sine`` (N,) with the sine of each point's elevation; 0 at the origin."""
     x = points[:, 0].copy()
@@ -428,14 +431,14 @@ def sines_of(points, sine):  # type: ignore[no-untyped-def]
         sine[i] = z[i] / (distance if distance > _ZERO else _ONE)
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def medians(values, bounds, middle):  # type: ignore[no-untyped-def]
     """Fill ``middle`` (K,) with the median of each part of ``values`` (N,) between K + 1 bounds."""
     for k in range(len(middle)):
         middle[k] = np.median(values[bounds[k] : bounds[k + 1]])
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def spreads(values, bounds, middle, spread):  # type: ignore[no-untyped-def]
     """Fill ``spread`` (K,) with the median distance of each part of ``values`` (N,) from its
     ``middle`` (K,)."""
@@ -443,7 +446,7 @@ def spreads(values, bounds, middle, spread):  # type: ignore[no-untyped-def]
         spread[k] = np.median(np.abs(values[bounds[k] : bounds[k + 1]] - _f(middle[k])))
 
 
-@numba.njit(error_model="numpy", cache=True)
+@_compiled
 def heights_of(points, bounds, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (N,) with the heights of the lasers by pairs of near and distant neighbours of a
     ring, and return their number."""

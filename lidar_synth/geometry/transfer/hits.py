@@ -12,6 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+_inlined = numba.njit(cache=True, nogil=True, inline="always")
+
 NEAREST = 0.6
 FARTHEST = 1.6
 """How far a footprint extends along grazing rays, as a factor of the distance of its return."""
@@ -122,7 +124,7 @@ def hit_triangles(vertices, triangles, rays, nearest):  # type: ignore[no-untype
             )
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _alone_first(rows, laser, i, j, k):  # type: ignore[no-untyped-def]
     """The three corners of a triangle, first the one that is alone on its side of a laser's
     cone."""
@@ -134,7 +136,7 @@ def _alone_first(rows, laser, i, j, k):  # type: ignore[no-untyped-def]
     return i, j, k
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _cut(vertices, rays, laser, p, q):  # type: ignore[no-untyped-def]
     """Where the cone of a laser cuts the edge from p to q: share of the way, x, y, azimuth."""
     points = vertices.points
@@ -147,7 +149,7 @@ def _cut(vertices, rays, laser, p, q):  # type: ignore[no-untyped-def]
     return share, x, y, vertices.azimuth[p] + share * turn
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _hit_segment(  # type: ignore[no-untyped-def]
     vertices, corners, start, end, normal, rays, laser, nearest
 ):
@@ -198,7 +200,7 @@ def _hit_segment(  # type: ignore[no-untyped-def]
             column = 0
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _turn(angle):  # type: ignore[no-untyped-def]
     """The difference of two azimuths in [-pi, pi], radians."""
     if angle > np.pi:
@@ -208,7 +210,7 @@ def _turn(angle):  # type: ignore[no-untyped-def]
     return angle
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _normal(points, i, j, k):  # type: ignore[no-untyped-def]
     """A vector perpendicular to a triangle, of any length."""
     ax = points[j, 0] - points[i, 0]
@@ -284,7 +286,7 @@ def hit_footprints(  # type: ignore[no-untyped-def]
                     column = 0
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _level_or_upright(points, i, level, upright):  # type: ignore[no-untyped-def]
     """The normal of a footprint: upward, or horizontal and along the ray of its return."""
     ux = upright[0]

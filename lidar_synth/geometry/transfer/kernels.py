@@ -4,6 +4,9 @@ zip."""
 import numba
 import numpy as np
 
+_compiled = numba.njit(cache=True, nogil=True)
+_inlined = numba.njit(cache=True, nogil=True, inline="always")
+
 SAME_RING = np.tan(np.radians(4.0))
 SAME_OBJECT = np.tan(np.radians(8.0))
 OTHER_OBJECT = np.tan(np.radians(25.0))
@@ -21,7 +24,7 @@ return."""
 _UNKNOWN = -1
 
 
-@numba.njit(cache=True, nogil=True)
+@_compiled
 def neighbours_below(starts, azimuth, step, bridge, below):  # type: ignore[no-untyped-def]
     """Fill ``below`` (N,) with the nearest return of the next ring within one step of azimuth; -1 =
     none.
@@ -46,7 +49,7 @@ def neighbours_below(starts, azimuth, step, bridge, below):  # type: ignore[no-u
                     below[i] = j
 
 
-@numba.njit(cache=True, nogil=True)
+@_compiled
 def find_level(points, below, level):  # type: ignore[no-untyped-def]
     """Mark in ``level`` (N,) the returns of nearly level surfaces, such as the road, by their
     neighbour below."""
@@ -66,13 +69,13 @@ def find_level(points, below, level):  # type: ignore[no-untyped-def]
             level[j] = True
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _exactly(points, i):  # type: ignore[no-untyped-def]
     """The coordinates of a float32 point in float64, which differences of near points need."""
     return np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _joined(points, distance, key, ground, level, i, j, across):  # type: ignore[no-untyped-def]
     """1 if two neighbouring returns are of one surface, else 0."""
     if abs(distance[i] - distance[j]) < NOISE:
@@ -93,7 +96,7 @@ def _joined(points, distance, key, ground, level, i, j, across):  # type: ignore
     )
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@_inlined
 def _around(azimuth, start, i, count):  # type: ignore[no-untyped-def]
     """Return ``i`` of a ring that begins at ``start``, which may be past its end, and its azimuth,
     radians."""
@@ -103,7 +106,7 @@ def _around(azimuth, start, i, count):  # type: ignore[no-untyped-def]
     return i, azimuth[i] + 2 * np.pi
 
 
-@numba.njit(cache=True, nogil=True)
+@_compiled
 def triangulate(  # type: ignore[no-untyped-def]
     rings, starts, azimuth, points, key, ground, level, below, step, bridge
 ):

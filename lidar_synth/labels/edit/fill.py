@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.labels.edit.rays import ScanRays
 
+_compiled = numba.njit(cache=True)
+
 SIDE = 32
 """Number of rays on each side of a hole from which its content is copied."""
 
@@ -114,7 +116,7 @@ class _Side(NamedTuple):
     ground: bool
 
 
-@numba.njit(cache=True)
+@_compiled
 def _fill(ring, donor, out):  # type: ignore[no-untyped-def]
     """Fill the holes of one ring."""
     count = len(ring.hole)
@@ -126,7 +128,7 @@ def _fill(ring, donor, out):  # type: ignore[no-untyped-def]
             _fill_hole(ring, first, length, donor, out)
 
 
-@numba.njit(cache=True)
+@_compiled
 def _fill_hole(ring, first, length, donor, out):  # type: ignore[no-untyped-def]
     """Fill the hole of some rays from the first on."""
     rays = (first + np.arange(length)) % len(ring.hole)
@@ -149,7 +151,7 @@ def _fill_hole(ring, first, length, donor, out):  # type: ignore[no-untyped-def]
             )
 
 
-@numba.njit(cache=True)
+@_compiled
 def _one_surface(ring, left, right, turn):  # type: ignore[no-untyped-def]
     """Whether both sides of a hole as wide as an angle show one surface."""
     a = left.rho
@@ -165,7 +167,7 @@ def _one_surface(ring, left, right, turn):  # type: ignore[no-untyped-def]
     )
 
 
-@numba.njit(cache=True)
+@_compiled
 def _between(left, right, turn, share):  # type: ignore[no-untyped-def]
     """Distance at a share of the way from the left to the right side of one surface."""
     of_left = 1 - share
@@ -176,7 +178,7 @@ def _between(left, right, turn, share):  # type: ignore[no-untyped-def]
     return 1 / (of_left / left.rho + of_right / right.rho)
 
 
-@numba.njit(cache=True)
+@_compiled
 def _estimate(ring, side, other, nth, between, far):  # type: ignore[no-untyped-def]
     """The ray that the nth ray of a hole is copied from, and its distance, inf = no return.
 
@@ -206,7 +208,7 @@ def _estimate(ring, side, other, nth, between, far):  # type: ignore[no-untyped-
     return source, np.inf
 
 
-@numba.njit(cache=True)
+@_compiled
 def _ahead(ring, side, turn):  # type: ignore[no-untyped-def]
     """Distance at the other edge of a plane wall through the returns of a side; inf = none."""
     if len(side.rays) < _BASE + 2 * _SMOOTH + 1:
@@ -219,7 +221,7 @@ def _ahead(ring, side, turn):  # type: ignore[no-untyped-def]
     return 1 / inverse if inverse > 0 else np.inf
 
 
-@numba.njit(cache=True)
+@_compiled
 def _side(ring, start, step, limit):  # type: ignore[no-untyped-def]
     """Collect the rays beside a hole, from its edge outwards, but not those that end on or in front
     of an object."""
@@ -240,7 +242,7 @@ def _side(ring, start, step, limit):  # type: ignore[no-untyped-def]
     return _Side(rays, _median(ring, returns[: 2 * _SMOOTH + 1]), ground)
 
 
-@numba.njit(cache=True)
+@_compiled
 def _median(ring, rays):  # type: ignore[no-untyped-def]
     """Median distance of the returns among rays; 0 = none."""
     values = ring.rho[rays[ring.known[rays]]]
