@@ -10,7 +10,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Annotated, Any
 
-import typer
+from typer import Exit, Option, Typer
 
 from lidar_synth import __version__
 from lidar_synth.cli.bake import bake
@@ -55,10 +55,10 @@ COMMANDS: dict[str, Callable[..., None] | str] = {
 """Commands by name, in the order of the help text; of the laboratory's, the module of
 ``lidar_synth.lab.cli``."""
 
-GROUPS: list[typer.Typer | str] = [bank, edit, "sensor", "skin", "metrics"]
+GROUPS: list[Typer | str] = [bank, edit, "sensor", "skin", "metrics"]
 """Commands with commands of their own; the laboratory's by name."""
 
-app = typer.Typer(
+app = Typer(
     cls=Commands,
     name="lidar-synth",
     help=(
@@ -77,12 +77,12 @@ app = typer.Typer(
 def _options(
     version: Annotated[
         bool,
-        typer.Option("--version", help="Print the version and exit.", is_eager=True),
+        Option("--version", help="Print the version and exit.", is_eager=True),
     ] = False,
 ) -> None:
     if version:
         print(f"lidar-synth {__version__}")
-        raise typer.Exit
+        raise Exit
 
 
 def _load(module: str, name: str) -> Any:

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Exit, Option, echo
 
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.cli.options import drop_missing, options_from
@@ -15,55 +15,51 @@ if TYPE_CHECKING:
 
 @options_from(BakeJob, after="config")
 def bake(
-    out: Annotated[
-        str, typer.Argument(metavar="OUT", help="folder or URL of the bank")
-    ],
+    out: Annotated[str, Argument(metavar="OUT", help="folder or URL of the bank")],
     config: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="YAML file with the options --model to --layout; the command line takes precedence"
         ),
     ] = None,
     engine: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="how to run: local | processes | ray | slurm | torchrun "
             "[the one that --workers, --address or --slurm is for, else local]"
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(
-            help="number of processes, actors or jobs [one per CPU core or GPU]"
-        ),
+        Option(help="number of processes, actors or jobs [one per CPU core or GPU]"),
     ] = None,
     address: Annotated[
         str | None,
-        typer.Option(help="address of a Ray cluster; 'auto' finds a running one"),
+        Option(help="address of a Ray cluster; 'auto' finds a running one"),
     ] = None,
     slurm: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             help="KEY=VALUE option for submitit, for instance slurm_partition=gpu; repeatable"
         ),
     ] = None,
     shard_index: Annotated[
         str,
-        typer.Option(
+        Option(
             help="write only every n-th shard, starting with this one; 'auto' reads the index of "
             "an array job"
         ),
     ] = "0",
     num_shards: Annotated[
         int | None,
-        typer.Option(
+        Option(
             help="the n of --shard-index: number of runs that share the work "
             "[1, or the size of the array job]"
         ),
     ] = None,
     dry_run: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--dry-run",
             help="print the size of the bank and the time and memory it takes, without baking",
         ),
@@ -144,18 +140,18 @@ def _run(
     try:
         index = bake(plan, engine, resources, share, progress=first)
     except KeyboardInterrupt:
-        typer.echo(
+        echo(
             f"stopped; finished shards are kept in {out}, the same command resumes",
             err=True,
         )
-        raise typer.Exit(130) from None
+        raise Exit(130) from None
     if index is None:
-        typer.echo(
+        echo(
             f"{out}: this share is finished; the last of all {len(plan.shards)} shards "
             "completes the bank"
         )
     else:
-        typer.echo(
+        echo(
             f"{out}: {index.scans} scans in {len(index.shards)} shards, "
             f"{index.size / 1e6:.3g} MB"
         )
@@ -170,7 +166,7 @@ def _report_unboxed(bank: str) -> None:
     opened = Bank(bank)
     found = measure(opened[i] for i in range(min(8, len(opened))))
     if found.objects:
-        typer.echo(
+        echo(
             f"  {found}; a detector needs labels: paste, which removes them and pastes "
             "objects with boxes"
         )
@@ -193,7 +189,7 @@ def _describe(plan: "BakePlan", engine: str) -> None:
     disk = f"{size:.3g} MB" if size < 1000 else f"{size / 1e3:.3g} GB"
     time = f"{minutes:.1f} minutes" if minutes < 120 else f"{minutes / 60:.1f} hours"
     shard = size / job.count * max(entry.scans for entry in shards)
-    typer.echo(
+    echo(
         f"{plan.out}: {job.count} scans in {len(shards)} shards of up to {job.shard_size}\n"
         f"  model {plan.facts.model} {plan.facts.checkpoint[:12]}, sensor "
         f"{plan.facts.sensor.name}\n"

@@ -4,22 +4,20 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Exit, Option, Typer, echo
 
 from lidar_synth.cli.options import Json, local_path
 
-BankFolder = Annotated[
-    str, typer.Argument(metavar="BANK", help="folder or URL of a bank")
-]
+BankFolder = Annotated[str, Argument(metavar="BANK", help="folder or URL of a bank")]
 Model = Annotated[
-    str | None, typer.Option(help="checkpoint file, if it is not a shipped model")
+    str | None, Option(help="checkpoint file, if it is not a shipped model")
 ]
 Condition = Annotated[
-    str | None, typer.Option(help="dataset of the conditions, if it has moved")
+    str | None, Option(help="dataset of the conditions, if it has moved")
 ]
 Out = Annotated[
     Path,
-    typer.Argument(metavar="OUT", help="folder of the new bank", parser=local_path),
+    Argument(metavar="OUT", help="folder of the new bank", parser=local_path),
 ]
 
 
@@ -27,15 +25,15 @@ def verify(
     bank: BankFolder,
     deep: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--deep", help="also regenerate some scans from their seeds and compare"
         ),
     ] = False,
     sample: Annotated[
-        int, typer.Option(min=1, help="number of scans that --deep regenerates")
+        int, Option(min=1, help="number of scans that --deep regenerates")
     ] = 16,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="seed that selects these scans [random]")
+        int | None, Option(min=0, help="seed that selects these scans [random]")
     ] = None,
     model: Model = None,
     condition: Condition = None,
@@ -57,32 +55,30 @@ def verify(
 
     problems = run(bank)
     for problem in problems:
-        typer.echo(f"{problem.file}: {problem.what}", err=True)
+        echo(f"{problem.file}: {problem.what}", err=True)
     if problems:
-        typer.echo(f"{bank}: {len(problems)} problems")
+        echo(f"{bank}: {len(problems)} problems")
         if any(problem.what != UNLISTED for problem in problems):
-            typer.echo(
-                f"lidar-synth repair {quote(bank)} regenerates what a model has made."
-            )
-        raise typer.Exit(1)
-    typer.echo(f"{bank}: intact")
+            echo(f"lidar-synth repair {quote(bank)} regenerates what a model has made.")
+        raise Exit(1)
+    echo(f"{bank}: intact")
     if not deep:
         return
     seed = secrets.randbits(32) if seed is None else seed
-    typer.echo(f"{bank}: scans selected by --seed {seed}")
+    echo(f"{bank}: scans selected by --seed {seed}")
     shares = regenerate(bank, model, sample, seed=seed, condition=condition)
     different = {name: share for name, share in shares.items() if share < AGREE}
     for name, share in different.items():
-        typer.echo(
+        echo(
             f"{name}: {share:.1%} of its cells agree with the regenerated scan",
             err=True,
         )
-    typer.echo(
+    echo(
         f"{bank}: {len(shares)} scans regenerated, at least {min(shares.values()):.2%} of the "
         "cells agree"
     )
     if different:
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 def repair(bank: BankFolder, model: Model = None, condition: Condition = None) -> None:
@@ -101,9 +97,9 @@ def repair(bank: BankFolder, model: Model = None, condition: Condition = None) -
 
     done = run(bank, model, condition=condition)
     for file, what in done.items():
-        typer.echo(f"{file}: {what}")
+        echo(f"{file}: {what}")
     if not done:
-        typer.echo(f"{bank}: intact, nothing to do")
+        echo(f"{bank}: intact, nothing to do")
 
 
 def info(bank: BankFolder, as_json: Json = False) -> None:
@@ -121,17 +117,17 @@ def info(bank: BankFolder, as_json: Json = False) -> None:
 
     values = summary(Bank(bank).index)
     if as_json:
-        typer.echo(json.dumps(values, indent=1))
+        echo(json.dumps(values, indent=1))
         return
     for name, value in values.items():
-        typer.echo(f"{name:<14}{value}")
+        echo(f"{name:<14}{value}")
 
 
 def merge(
     out: Out,
     banks: Annotated[
         list[str],
-        typer.Argument(metavar="BANK...", help="banks with the same sensor and fields"),
+        Argument(metavar="BANK...", help="banks with the same sensor and fields"),
     ],
 ) -> None:
     """Merges several banks into one. Shards are hard-linked instead of copied where the file system
@@ -145,14 +141,14 @@ def merge(
     from lidar_synth.bank import Bank
 
     index = run([Bank(path) for path in banks], out)
-    typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
+    echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
 
 
 def split(
     bank: BankFolder,
     parts: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="FOLDER=SHARE...",
             help="folders, each with its share of the scans; the shares sum to 1",
         ),
@@ -178,13 +174,13 @@ def split(
                 f"part {part!r}", "FOLDER=SHARE, such as train=0.9, each folder once"
             )
     for out, index in run(Bank(bank), shares).items():
-        typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
+        echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
 
 
 def head(
     bank: BankFolder,
     out: Out,
-    count: Annotated[int, typer.Option(help="number of scans")] = 100,
+    count: Annotated[int, Option(help="number of scans")] = 100,
 ) -> None:
     """Makes a bank from the first scans of another one.
 
@@ -196,31 +192,31 @@ def head(
     from lidar_synth.bank import Bank
 
     index = run(Bank(bank), count, out)
-    typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
+    echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
 
 
 def as_sensor(
     bank: BankFolder,
     out: Out,
     sensor: Annotated[
-        str, typer.Option(help="sensor of the new bank: a preset or a YAML file")
+        str, Option(help="sensor of the new bank: a preset or a YAML file")
     ],
     mount: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="Z,PITCH", help="metres higher, degrees looking further down [0,0]"
         ),
     ] = None,
     like: Annotated[
         Path | None,
-        typer.Option(help="real scans of that sensor, to match its reflectance"),
+        Option(help="real scans of that sensor, to match its reflectance"),
     ] = None,
     range_noise: Annotated[
-        float, typer.Option(help="metres, noise beyond that of the bank")
+        float, Option(help="metres, noise beyond that of the bank")
     ] = 0.0,
     reach: Annotated[
         float | None,
-        typer.Option(
+        Option(
             help="metres at which it loses every second ray to a surface of 10 % reflectance"
         ),
     ] = None,
@@ -244,10 +240,10 @@ def as_sensor(
         sensor, read_mount(mount), like, source, range_noise=range_noise, reach=reach
     )
     index = turn_bank(source, out, transfer)
-    typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
+    echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
 
 
-bank = typer.Typer(
+bank = Typer(
     name="bank",
     help="Makes new banks from existing ones: merge, split, head, as-sensor.",
     no_args_is_help=True,

@@ -4,7 +4,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option, echo
 
 from lidar_synth.cli.options import Reading, drop_missing, options_from
 
@@ -17,25 +17,25 @@ if TYPE_CHECKING:
 def check_mix(
     mix: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="MIX.yaml", help="settings of a mixture, as trainers take them"
         ),
     ],
     real: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="REAL", help="folder or root of the dataset with the real scans"
         ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="picture to write: .png (sheet) or .html (interactive page)"),
+        Option(help="picture to write: .png (sheet) or .html (interactive page)"),
     ] = None,
     count: Annotated[
-        int, typer.Option(min=4, max=64, help="number of scans of each kind")
+        int, Option(min=4, max=64, help="number of scans of each kind")
     ] = 8,
     sensor: Annotated[
-        str | None, typer.Option(help="sensor of the real scans [named by the files]")
+        str | None, Option(help="sensor of the real scans [named by the files]")
     ] = None,
     **reading: Any,
 ) -> None:
@@ -91,7 +91,7 @@ def check_mix(
             [*kinds[0][:4], *kinds[1][:4]],
             title=f"{real.resolve().name}, then {mix.name}",
         )
-        typer.echo(f"{out}: real scans, then synthetic ones")
+        echo(f"{out}: real scans, then synthetic ones")
     report(list(contradictions(theirs, ours)))
 
 

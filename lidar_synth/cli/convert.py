@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
 from lidar_synth.cli.options import (
     Format,
@@ -23,41 +23,37 @@ if TYPE_CHECKING:
 
 InputSensor = Annotated[
     str | None,
-    typer.Option(
-        help="sensor of the input: a preset or a YAML file [named by the files]"
-    ),
+    Option(help="sensor of the input: a preset or a YAML file [named by the files]"),
 ]
 AsSensorName = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="scans as this sensor would have recorded them: a preset or a YAML file"
     ),
 ]
 MountText = Annotated[
     str | None,
-    typer.Option(
+    Option(
         metavar="Z,PITCH",
         help="of --as-sensor: metres higher, degrees looking further down [0,0]",
     ),
 ]
 Sweeps = Annotated[
     int,
-    typer.Option(
+    Option(
         help="of --as-sensor: scans before and after, which fill gaps by their poses"
     ),
 ]
 Like = Annotated[
     Path | None,
-    typer.Option(
-        help="of --as-sensor: real scans of that sensor, to match its reflectance"
-    ),
+    Option(help="of --as-sensor: real scans of that sensor, to match its reflectance"),
 ]
 RangeNoise = Annotated[
-    float, typer.Option(help="of --as-sensor: metres, noise beyond that of the input")
+    float, Option(help="of --as-sensor: metres, noise beyond that of the input")
 ]
 Reach = Annotated[
     float | None,
-    typer.Option(
+    Option(
         help=(
             "of --as-sensor: metres at which it loses every second ray to a surface of 10 % "
             "reflectance"
@@ -66,17 +62,17 @@ Reach = Annotated[
 ]
 Unfold = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--unfold", help="assign one row to each laser, from KITTI's order of points"
     ),
 ]
 Strict = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--strict", help="stop at a scan with something that the format cannot hold"
     ),
 ]
-Jobs = Annotated[int, typer.Option(help="number of worker processes")]
+Jobs = Annotated[int, Option(help="number of worker processes")]
 
 
 @options_from(Reading, after="sensor")

@@ -2,7 +2,7 @@
 
 import json
 
-import typer
+from typer import Exit, echo
 
 from lidar_synth.cli.options import Json
 
@@ -21,6 +21,6 @@ def doctor(as_json: Json = False) -> None:
     from lidar_synth.cli.diagnosis import as_dict, examine, report, works
 
     findings = examine()
-    typer.echo(json.dumps(as_dict(findings), indent=2) if as_json else report(findings))
+    echo(json.dumps(as_dict(findings), indent=2) if as_json else report(findings))
     if not works(findings):
-        raise typer.Exit(1)
+        raise Exit(1)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Context, Option, Typer
 
 from lidar_synth.cli.convert import InputSensor, print_report, read_numbers
 from lidar_synth.cli.options import (
@@ -19,7 +19,7 @@ from lidar_synth.cli.options import (
 if TYPE_CHECKING:
     from lidar_synth.geometry.scan import Scan
 
-edit = typer.Typer(
+edit = Typer(
     name="edit",
     help="Surgery on scans: remove, insert and move objects with their boxes. A folder takes one "
     "edit of a scan.",
@@ -28,15 +28,15 @@ edit = typer.Typer(
 
 Model = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="model that draws the holes, for instance town [none: filled by geometry]"
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="seed of the model's noise")]
-ScanNumber = Annotated[int, typer.Option(min=0, help="number of the scan in IN")]
+Seed = Annotated[int, Option(min=0, help="seed of the model's noise")]
+ScanNumber = Annotated[int, Option(min=0, help="number of the scan in IN")]
 Place = Annotated[
     str,
-    typer.Option(
+    Option(
         metavar="X,Y[,YAW]",
         help="metres, and degrees; without a yaw the recorded side faces the sensor",
     ),
@@ -46,18 +46,16 @@ Place = Annotated[
 @edit.command("remove")
 @options_from(Reading, after="sensor")
 def remove_objects(
-    context: typer.Context,
+    context: Context,
     source: Source,
     out: Out,
-    box: Annotated[
-        list[int] | None, typer.Option(help="number of a box; repeatable")
-    ] = None,
+    box: Annotated[list[int] | None, Option(help="number of a box; repeatable")] = None,
     name: Annotated[
         list[str] | None,
-        typer.Option(help="remove all boxes of this class, for instance Car"),
+        Option(help="remove all boxes of this class, for instance Car"),
     ] = None,
     scan: Annotated[
-        int | None, typer.Option(min=0, help="number of the scan in IN [all]")
+        int | None, Option(min=0, help="number of the scan in IN [all]")
     ] = None,
     model: Model = None,
     seed: Seed = 0,
@@ -92,16 +90,12 @@ def remove_objects(
 @edit.command("insert")
 @options_from(Reading, after="sensor")
 def insert_object(
-    context: typer.Context,
+    context: Context,
     source: Source,
     out: Out,
-    objects: Annotated[
-        str, typer.Option(help="a bank of objects, .npz, of ObjectBank.save")
-    ],
+    objects: Annotated[str, Option(help="a bank of objects, .npz, of ObjectBank.save")],
     at: Place,
-    number: Annotated[
-        int, typer.Option(min=0, help="number of the object in the bank")
-    ] = 0,
+    number: Annotated[int, Option(min=0, help="number of the object in the bank")] = 0,
     scan: ScanNumber = 0,
     to: Format = "npz",
     sensor: InputSensor = None,
@@ -130,10 +124,10 @@ def insert_object(
 @edit.command("move")
 @options_from(Reading, after="sensor")
 def move_object(
-    context: typer.Context,
+    context: Context,
     source: Source,
     out: Out,
-    box: Annotated[int, typer.Option(min=0, help="number of the box")],
+    box: Annotated[int, Option(min=0, help="number of the box")],
     at: Place,
     scan: ScanNumber = 0,
     model: Model = None,
@@ -166,7 +160,7 @@ def _print_last(out: Path, edited: Any) -> None:
     )
 
 
-def _edit(context: typer.Context, change: Callable[["Scan"], Any]) -> Any:
+def _edit(context: Context, change: Callable[["Scan"], Any]) -> Any:
     """Write one scan of a source, or all, as they are after a change; the last one.
 
     Several edits of single scans may share a folder, each of another scan: beside it stands the

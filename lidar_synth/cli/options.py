@@ -6,9 +6,9 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-import typer
 from pydantic import BaseModel, Field
 from pydantic.fields import FieldInfo
+from typer import Argument, BadParameter, Option
 
 FORMATS = (
     "output format: npz (keeps every field) | kitti | semantic_kitti | kitti_object | kitti360 | "
@@ -21,7 +21,7 @@ def local_path(text: str) -> Path:
     """The path of a file or folder to write, for typer to parse; a URL, which ``Path`` would turn
     into a folder ``s3:``, is refused."""
     if "://" in text:
-        raise typer.BadParameter(
+        raise BadParameter(
             f"{text}; expected a folder or file on this machine. Only bake writes to URLs: copy "
             "the result there afterwards."
         )
@@ -30,17 +30,17 @@ def local_path(text: str) -> Path:
 
 Source = Annotated[
     str,
-    typer.Argument(
+    Argument(
         metavar="IN",
         help="file, folder of scans or root of a dataset; a bank may be at a URL",
     ),
 ]
 Out = Annotated[
     Path,
-    typer.Argument(metavar="OUT", help="folder to write to", parser=local_path),
+    Argument(metavar="OUT", help="folder to write to", parser=local_path),
 ]
-Format = Annotated[str, typer.Option(help=FORMATS)]
-Json = Annotated[bool, typer.Option("--json", help="print JSON")]
+Format = Annotated[str, Option(help=FORMATS)]
+Json = Annotated[bool, Option("--json", help="print JSON")]
 
 
 class Reading(BaseModel):
@@ -115,10 +115,10 @@ def _option(name: str, field: FieldInfo) -> inspect.Parameter:
     annotation: Any
     if base is tuple:
         annotation = Annotated[
-            Any, typer.Option(help=text, parser=_names, metavar="NAME,...")
+            Any, Option(help=text, parser=_names, metavar="NAME,...")
         ]
     else:
-        annotation = Annotated[base | None, typer.Option(help=text)]
+        annotation = Annotated[base | None, Option(help=text)]
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
     )

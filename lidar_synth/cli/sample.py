@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-import typer
+from typer import Option, echo
 
 from lidar_synth.cli.options import Format, Out
 
@@ -10,24 +10,24 @@ from lidar_synth.cli.options import Format, Out
 def sample(
     out: Out,
     model: Annotated[
-        str, typer.Option(help="name of a shipped model, or a .safetensors checkpoint")
+        str, Option(help="name of a shipped model, or a .safetensors checkpoint")
     ] = "town",
-    count: Annotated[int, typer.Option(min=1, help="number of scans")] = 16,
+    count: Annotated[int, Option(min=1, help="number of scans")] = 16,
     seed: Annotated[
         int,
-        typer.Option(min=0, help="scan i is a function of the model, the seed and i"),
+        Option(min=0, help="scan i is a function of the model, the seed and i"),
     ] = 0,
     steps: Annotated[
-        int | None, typer.Option(min=1, help="number of steps [the model's own]")
+        int | None, Option(min=1, help="number of steps [the model's own]")
     ] = None,
     times: Annotated[
         str | None,
-        typer.Option(help="time grid instead of --steps, such as 1,0.86,0.58,0.22,0"),
+        Option(help="time grid instead of --steps, such as 1,0.86,0.58,0.22,0"),
     ] = None,
-    solver: Annotated[str, typer.Option(help="ODE solver: euler | heun")] = "euler",
+    solver: Annotated[str, Option(help="ODE solver: euler | heun")] = "euler",
     condition: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help=(
                 "dataset with the labels, images or boxes that a conditional model needs, or a "
                 "layout.yaml"
@@ -35,15 +35,15 @@ def sample(
         ),
     ] = None,
     condition_layout: Annotated[
-        str | None, typer.Option(help="layout of that dataset [detected]")
+        str | None, Option(help="layout of that dataset [detected]")
     ] = None,
     condition_split: Annotated[
         str | None,
-        typer.Option(help="split of that dataset, for instance r2flow/train"),
+        Option(help="split of that dataset, for instance r2flow/train"),
     ] = None,
     objects: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help=(
                 "what stands in the boxes of layouts: town, objects that are cast there | "
                 "drawn, by the model [town]"
@@ -52,24 +52,22 @@ def sample(
     ] = None,
     guidance: Annotated[
         float,
-        typer.Option(
+        Option(
             min=0, max=100, help="scale of classifier-free guidance; 1 = no guidance"
         ),
     ] = 1.0,
     to: Format = "npz",
-    device: Annotated[
-        str, typer.Option(help="device of the network: cpu | cuda")
-    ] = "cpu",
+    device: Annotated[str, Option(help="device of the network: cpu | cuda")] = "cpu",
     dtype: Annotated[
         str,
-        typer.Option(help="data type of the network's computation: float32 | bfloat16"),
+        Option(help="data type of the network's computation: float32 | bfloat16"),
     ] = "float32",
     batch: Annotated[
-        int | None, typer.Option(min=1, help="scans per batch; limits the memory")
+        int | None, Option(min=1, help="scans per batch; limits the memory")
     ] = None,
     columns: Annotated[
         int | None,
-        typer.Option(help="columns of the scans, for models that know several"),
+        Option(help="columns of the scans, for models that know several"),
     ] = None,
 ) -> None:
     """Generates scans and writes them in any format. Run it again to resume an interrupted run.
@@ -120,4 +118,4 @@ def sample(
         "columns": columns,
     }
     written = samples.write(writer, count, asked)
-    typer.echo(f"{out}: {written} scans written, {count - written} were there already")
+    echo(f"{out}: {written} scans written, {count - written} were there already")

@@ -4,7 +4,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option, echo
 
 from lidar_synth.cli.convert import InputSensor
 from lidar_synth.cli.options import Reading, drop_missing, local_path, options_from
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 def view(
     path: Annotated[
         str,
-        typer.Argument(help="file, folder, root of a dataset, or bank, also its URL"),
+        Argument(help="file, folder, root of a dataset, or bank, also its URL"),
     ],
     index: Annotated[
-        int, typer.Option(help="number of the first scan, from 0; -1 is the last one")
+        int, Option(help="number of the first scan, from 0; -1 is the last one")
     ] = 0,
-    count: Annotated[int, typer.Option(min=1, max=256, help="number of scans")] = 1,
+    count: Annotated[int, Option(min=1, max=256, help="number of scans")] = 1,
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="file to write: .png (sheet) or .html (interactive page)",
             parser=local_path,
         ),
@@ -60,7 +60,7 @@ def view(
             return
         out = Path(f"{Path(path).resolve().stem or 'scans'}-{index}.html")
     write_view(out, scans, title=Path(path).resolve().name)
-    typer.echo(f"{out}: {len(scans)} of the scans in {path}")
+    echo(f"{out}: {len(scans)} of the scans in {path}")
 
 
 def _read(source: "ScanFiles", index: int, count: int) -> "list[Scan]":

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option, echo
 
 from lidar_synth.cli.options import Reading, drop_missing, options_from
 
@@ -12,37 +12,35 @@ from lidar_synth.cli.options import Reading, drop_missing, options_from
 def adapt(
     model: Annotated[
         str,
-        typer.Argument(metavar="MODEL", help="a shipped model such as town, or a file"),
+        Argument(metavar="MODEL", help="a shipped model such as town, or a file"),
     ],
     scans: Annotated[
         Path,
-        typer.Option(
+        Option(
             metavar="ROOT", help="20 to 200 scans of one sensor, with labels or without"
         ),
     ],
     out: Annotated[
         Path,
-        typer.Option(
+        Option(
             metavar="FILE", help="checkpoint to write; its name ends in .safetensors"
         ),
     ],
     minutes: Annotated[
-        float, typer.Option(min=0.01, help="limit of the time of all trainings")
+        float, Option(min=0.01, help="limit of the time of all trainings")
     ] = 120.0,
     licence: Annotated[
-        str, typer.Option(help="licence of the scans, which the checkpoint states")
+        str, Option(help="licence of the scans, which the checkpoint states")
     ] = "that of the scans",
     sensor: Annotated[
-        str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
+        str | None, Option(help="sensor of the scans: a preset or a YAML file")
     ] = None,
     town: Annotated[
         int,
-        typer.Option(
-            min=0, help="scans of the town, as your sensor sees it, to learn too"
-        ),
+        Option(min=0, help="scans of the town, as your sensor sees it, to learn too"),
     ] = 400,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="print the plan and do nothing")
+        bool, Option("--dry-run", help="print the plan and do nothing")
     ] = False,
     **reading: Any,
 ) -> None:
@@ -61,7 +59,7 @@ def adapt(
 
     given = drop_missing(reading)
     if dry_run:
-        typer.echo(plan_adaptation(model, scans, out, minutes, sensor, town, **given))
+        echo(plan_adaptation(model, scans, out, minutes, sensor, town, **given))
         return
     path = run(
         model,
@@ -73,4 +71,4 @@ def adapt(
         town=town,
         **given,
     )
-    typer.echo(f"{path}\nIts card is {path.with_suffix('.md')}")
+    echo(f"{path}\nIts card is {path.with_suffix('.md')}")

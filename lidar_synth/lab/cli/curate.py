@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option, echo
 
 from lidar_synth.cli.bank import BankFolder
 from lidar_synth.cli.options import Json, local_path
@@ -22,43 +22,37 @@ def curate(
     bank: BankFolder,
     drop: Annotated[
         list[str] | None,
-        typer.Option(
-            help="rule that selects scans to drop; repeatable, any match drops"
-        ),
+        Option(help="rule that selects scans to drop; repeatable, any match drops"),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="folder of the curated bank; without it nothing is written",
             parser=local_path,
         ),
     ] = None,
     reference: Annotated[
         str | None,
-        typer.Option(
-            help="scans whose mean histograms to compare with [the bank's own]"
-        ),
+        Option(help="scans whose mean histograms to compare with [the bank's own]"),
     ] = None,
     split: Annotated[
         str | None,
-        typer.Option(help="split of the reference, for instance r2flow/test"),
+        Option(help="split of the reference, for instance r2flow/test"),
     ] = None,
     sort: Annotated[
         str,
-        typer.Option(
-            help="sort the list by this score, highest first; -SCORE: lowest first"
-        ),
+        Option(help="sort the list by this score, highest first; -SCORE: lowest first"),
     ] = "range",
-    limit: Annotated[int, typer.Option(min=0, help="number of scans to list")] = 10,
+    limit: Annotated[int, Option(min=0, help="number of scans to list")] = 10,
     plot: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="PNG file to write with the distribution of every score",
             parser=local_path,
         ),
     ] = None,
     as_json: Json = False,
-    jobs: Annotated[int, typer.Option(min=1, help="number of worker processes")] = 1,
+    jobs: Annotated[int, Option(min=1, help="number of worker processes")] = 1,
 ) -> None:
     """Scores every scan of a bank, lists the most unusual ones, and writes a bank without those
     that match a rule.
@@ -107,7 +101,7 @@ def curate(
             _row(opened, scores, number) | {"dropped": bool(dropped[number])}
             for number in shown.tolist()
         ]
-        typer.echo(
+        echo(
             json.dumps(
                 {"scans": len(opened), "dropped": int(dropped.sum()), "listed": rows},
                 indent=1,
@@ -128,7 +122,7 @@ def curate(
         opened, np.flatnonzero(dropped).tolist(), why, out, progress=not as_json
     )
     if not as_json:
-        typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards; {why}")
+        echo(f"{out}: {index.scans} scans in {len(index.shards)} shards; {why}")
 
 
 def _check(plot: Path | None, out: Path | None, rules: list[str]) -> None:
@@ -222,13 +216,13 @@ def _table(
     import numpy as np
 
     heads = ("lowest", "1 %", "median", "99 %", "highest")
-    typer.echo(f"{'':<12}" + "".join(f"{head:>10}" for head in heads))
+    echo(f"{'':<12}" + "".join(f"{head:>10}" for head in heads))
     for name, values in scores.values.items():
-        typer.echo(
+        echo(
             f"{name:<12}"
             + "".join(f"{v:>10.4f}" for v in np.percentile(values, (0, 1, 50, 99, 100)))
         )
-    typer.echo(
+    echo(
         f"\n{'number':>8}  {'id':<24}"
         + "".join(f"{name:>12}" for name in scores.values)
         + "    twin"
@@ -239,8 +233,8 @@ def _table(
         figures = "".join(
             f"{values[number]:>12.4f}" for values in scores.values.values()
         )
-        typer.echo(f"{number:>8}  {bank.ids[number]:<24}{figures}{twin:>8}{mark}")
-    typer.echo(f"\n{dropped.sum()} of {len(bank)} scans match the rules")
+        echo(f"{number:>8}  {bank.ids[number]:<24}{figures}{twin:>8}{mark}")
+    echo(f"\n{dropped.sum()} of {len(bank)} scans match the rules")
 
 
 def _plot(

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, BadParameter, Option, echo
 
 from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 
@@ -17,82 +17,82 @@ if TYPE_CHECKING:
 def evaluate(
     real: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="REAL", help="reference scans: root of a dataset, or a folder"
         ),
     ],
     fake: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="FAKE", help="scans to evaluate: root of a dataset, or a folder"
         ),
     ],
     protocol: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="definitions of the metrics: r2flow | lidm | r3dpa | spiral | town | general"
         ),
     ] = None,
     judge: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="archive of lidar-bonnetal: how well its network recognises both sets"
         ),
     ] = None,
     objects: Annotated[
         bool,
-        typer.Option(
+        Option(
             help="how well a small classifier tells the cars and persons of both sets apart"
         ),
     ] = False,
     detector: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="OpenPCDet's PointPillars or CenterPoint: how well it finds the boxes of both sets"
         ),
     ] = None,
     columns: Annotated[
-        int | None, typer.Option(help="width of the judge's grid; its own by default")
+        int | None, Option(help="width of the judge's grid; its own by default")
     ] = None,
     sensor: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="sensor of both sets: a preset or a YAML file; the next options are of REAL"
         ),
     ] = None,
     segmenter: Annotated[
-        bool, typer.Option(help="add metrics on features of the town's segmenter")
+        bool, Option(help="add metrics on features of the town's segmenter")
     ] = False,
     weights: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="folder with published weights, for FRD, FRID, FPD, FSVD, FPVD, FLD"
         ),
     ] = None,
     extended: Annotated[
         bool,
-        typer.Option(
+        Option(
             help="of features, add unbiased forms, precision, recall, density, coverage"
         ),
     ] = False,
     intervals: Annotated[
-        int, typer.Option(help="resamples for 95 % intervals, for instance 200")
+        int, Option(help="resamples for 95 % intervals, for instance 200")
     ] = 0,
     beside: Annotated[
-        bool, typer.Option(help="print the published figures of the protocol, too")
+        bool, Option(help="print the published figures of the protocol, too")
     ] = False,
     cache: Annotated[
-        Path | None, typer.Option(help="folder in which features are kept")
+        Path | None, Option(help="folder in which features are kept")
     ] = None,
     processes: Annotated[
-        int, typer.Option(help="processes that extract features; needs --cache", min=1)
+        int, Option(help="processes that extract features; needs --cache", min=1)
     ] = 1,
     training_data: Annotated[
-        bool, typer.Option(help="permit a reference that the model was trained on")
+        bool, Option(help="permit a reference that the model was trained on")
     ] = False,
     anyway: Annotated[
         bool,
-        typer.Option(help="compare fewer scans than the paper's, and other sensors"),
+        Option(help="compare fewer scans than the paper's, and other sensors"),
     ] = False,
     as_json: Json = False,
     **reading: Any,
@@ -137,12 +137,12 @@ def evaluate(
     judges = [judge, detector, objects or None]
     judged = sum(given is not None for given in judges)
     if beside and (as_json or judged):
-        raise typer.BadParameter(
+        raise BadParameter(
             "goes with --protocol and prints tables: leave out --json",
             param_hint="--beside",
         )
     if (protocol is not None) + judged != 1:
-        raise typer.BadParameter(
+        raise BadParameter(
             "give --protocol, --judge, --objects or --detector, one of them",
             param_hint="--protocol",
         )
@@ -161,7 +161,7 @@ def evaluate(
     ):
         for option, given in options.items():
             if given and chosen is None:
-                raise typer.BadParameter(f"goes with {needed}", param_hint=option)
+                raise BadParameter(f"goes with {needed}", param_hint=option)
     if protocol is not None:
         rules = choose("--protocol", protocol, PROTOCOLS)
     given_for_real = drop_missing(reading)
@@ -179,7 +179,7 @@ def evaluate(
                 f"Convert them first: lidar-synth convert {fake} OUT --to npz.",
             ) from error
     if not training_data and (note := refuse_training_data(*sources, reading["split"])):
-        typer.echo(note, err=True)
+        echo(note, err=True)
     if judge is not None:
         _recognition(judge, columns, sources, as_json)
         return
@@ -207,13 +207,13 @@ def evaluate(
     )
     _print([asdict(s) for s in scores], "\n".join(map(str, scores)), as_json)
     for note in filter(None, (describe_missing(left_out, rules), rules.unverified)):
-        typer.echo(note, err=True)
+        echo(note, err=True)
     if beside:
-        typer.echo(f"\n{published(scores)}")
+        echo(f"\n{published(scores)}")
 
 
 def _print(figures: object, text: str, as_json: bool) -> None:
-    typer.echo(json.dumps(figures, indent=2) if as_json else text)
+    echo(json.dumps(figures, indent=2) if as_json else text)
 
 
 def _objects(sources: "tuple[Source, Source]", as_json: bool) -> None:

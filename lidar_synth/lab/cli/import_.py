@@ -4,28 +4,28 @@ package."""
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from lidar_synth.errors import ConfigError
 
 
 def import_(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="released weights: .pth or .ckpt")
+        Path, Argument(metavar="FILE", help="released weights: .pth or .ckpt")
     ],
     out: Annotated[
-        Path, typer.Argument(metavar="OUT.safetensors", help="checkpoint to write")
+        Path, Argument(metavar="OUT.safetensors", help="checkpoint to write")
     ],
     peer: Annotated[
-        str, typer.Option(help="project of the weights: r2flow | lidm | r2dm")
+        str, Option(help="project of the weights: r2flow | lidm | r2dm")
     ] = "r2flow",
     check: Annotated[
         bool,
-        typer.Option("--check", help="generate scans in ten steps, and look at them"),
+        Option("--check", help="generate scans in ten steps, and look at them"),
     ] = False,
     condition: Annotated[
         str | None,
-        typer.Option(help="dataset whose labels or images --check takes"),
+        Option(help="dataset whose labels or images --check takes"),
     ] = None,
 ) -> None:
     """Converts the released weights of another project to a checkpoint.

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from lidar_synth.cli.options import Json, local_path
 
@@ -13,34 +13,30 @@ if TYPE_CHECKING:
 
 
 def label(
-    dataset: Annotated[str, typer.Argument(metavar="DATASET", help="kitti360")],
+    dataset: Annotated[str, Argument(metavar="DATASET", help="kitti360")],
     root: Annotated[
         Path,
-        typer.Argument(
-            metavar="ROOT", help="root of the dataset, with data_3d_semantics"
-        ),
+        Argument(metavar="ROOT", help="root of the dataset, with data_3d_semantics"),
     ],
     out: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="OUT", help="folder to write to; may be ROOT", parser=local_path
         ),
     ],
     split: Annotated[
-        str, typer.Option(help="drives to label, for instance r2flow/train")
+        str, Option(help="drives to label, for instance r2flow/train")
     ] = "all",
     against: Annotated[
         Path | None,
-        typer.Option(
-            help="folder with known labels per scan, to compare the new ones with"
-        ),
+        Option(help="folder with known labels per scan, to compare the new ones with"),
     ] = None,
     jobs: Annotated[
-        int, typer.Option(help="number of worker processes; each needs 1 to 3 GB")
+        int, Option(help="number of worker processes; each needs 1 to 3 GB")
     ] = 1,
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="only count the frames that would get labels"),
+        Option("--dry-run", help="only count the frames that would get labels"),
     ] = False,
     as_json: Json = False,
 ) -> None:

@@ -3,14 +3,14 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Typer, echo
 
 from lidar_synth.cli.options import Json
 
 if TYPE_CHECKING:
     from lidar_synth.lab.evaluate.extractors import ExtractorSpec
 
-metrics = typer.Typer(
+metrics = Typer(
     name="metrics",
     help="Weights that the field's measures need: setup.",
     no_args_is_help=True,
@@ -26,7 +26,7 @@ def _commands() -> None:
 def setup(
     folder: Annotated[
         Path | None,
-        typer.Argument(
+        Argument(
             metavar="[FOLDER]",
             help="folder of the weights; default: $LIDAR_SYNTH_METRICS",
         ),
@@ -56,15 +56,15 @@ def setup(
     folder = folder or (Path(named) if named else None)
     found = {name: _status(name, spec, folder) for name, spec in EXTRACTORS.items()}
     if as_json:
-        typer.echo(json.dumps(found, indent=2))
+        echo(json.dumps(found, indent=2))
         return
     where = f"{folder}" if folder else f"no folder: set {FOLDER_VARIABLE}, or name one"
-    typer.echo(f"Folder: {where}")
+    echo(f"Folder: {where}")
     for name, facts in found.items():
-        typer.echo(f"\n{name} ({facts['measure']}): {facts['state']}")
+        echo(f"\n{name} ({facts['measure']}): {facts['state']}")
         for key in ("file", "contents", "from", "licence", "hash", "sha256"):
             if facts[key]:
-                typer.echo(f"  {key:9}{facts[key]}")
+                echo(f"  {key:9}{facts[key]}")
 
 
 def _status(name: str, spec: "ExtractorSpec", folder: Path | None) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option, echo
 
 from lidar_synth.cli.options import Reading, drop_missing, options_from
 
@@ -19,102 +19,96 @@ _ARMS = (
 def prove(
     root: Annotated[
         Path,
-        typer.Argument(
-            metavar="ROOT", help="labelled scans, in any layout that is read"
-        ),
+        Argument(metavar="ROOT", help="labelled scans, in any layout that is read"),
     ],
     out: Annotated[
         Path,
-        typer.Option(help="folder of the page and of all that is needed to resume"),
+        Option(help="folder of the page and of all that is needed to resume"),
     ] = Path("proof"),
     minutes: Annotated[
-        float | None, typer.Option(min=1, help="limit of the time [none]")
+        float | None, Option(min=1, help="limit of the time [none]")
     ] = None,
     labelled: Annotated[
         int | None,
-        typer.Option(min=1, help="labelled scans of a training [all, at most 200]"),
+        Option(min=1, help="labelled scans of a training [all, at most 200]"),
     ] = None,
-    arm: Annotated[list[str] | None, typer.Option(help=_ARMS)] = None,
+    arm: Annotated[list[str] | None, Option(help=_ARMS)] = None,
     ratio: Annotated[
         list[float] | None,
-        typer.Option(help="share of synthetic scans, repeatable [0.5]"),
+        Option(help="share of synthetic scans, repeatable [0.5]"),
     ] = None,
     iterations: Annotated[
         int | None,
-        typer.Option(
+        Option(
             min=10,
             help="of each training; fewer if --minutes is short [1000, of a detector 800]",
         ),
     ] = None,
     batch: Annotated[
         int | None,
-        typer.Option(min=1, help="scans of an iteration [4, of a detector 2]"),
+        Option(min=1, help="scans of an iteration [4, of a detector 2]"),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option(min=1, help="repetitions of each training [2]")
+        int | None, Option(min=1, help="repetitions of each training [2]")
     ] = None,
     places: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="how places are told apart: drive | pose | stretch | stretch:N [auto]"
         ),
     ] = None,
     model: Annotated[
         str | None,
-        typer.Option(help="of the arms with a generator: a name or a file [town]"),
+        Option(help="of the arms with a generator: a name or a file [town]"),
     ] = None,
     synthetic: Annotated[
         int | None,
-        typer.Option(
-            min=1, help="synthetic scans of each kind [150, for a detector 120]"
-        ),
+        Option(min=1, help="synthetic scans of each kind [150, for a detector 120]"),
     ] = None,
     classes: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="pooled classes: semantic_kitti | pandaset | kitti360 | nuscenes [auto]"
         ),
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="CLASS", help="mean IoU over this class, repeatable"),
+        Option(metavar="CLASS", help="mean IoU over this class, repeatable"),
     ] = None,
     trainer: Annotated[
         str | None,
-        typer.Option(
-            help="your own trainer: a command with {job}, the mixture as YAML"
-        ),
+        Option(help="your own trainer: a command with {job}, the mixture as YAML"),
     ] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
+        str | None, Option(help="sensor of the scans: a preset or a YAML file")
     ] = None,
     beams: Annotated[
         int | None,
-        typer.Option(
+        Option(
             metavar="N",
             help="evenly spaced beams that all scans keep, such as 32 [all]",
         ),
     ] = None,
     tests: Annotated[
         Path | None,
-        typer.Option(help="labelled scans of other places to test on"),
+        Option(help="labelled scans of other places to test on"),
     ] = None,
     pools: Annotated[
         Path | None,
-        typer.Option(help="folder of the synthetic scans, to share between runs"),
+        Option(help="folder of the synthetic scans, to share between runs"),
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="processes [one for each core]")
+        int | None, Option(min=1, help="processes [one for each core]")
     ] = None,
     task: Annotated[
         str,
-        typer.Option(help="segmentation | detection: cars and persons, by boxes"),
+        Option(help="segmentation | detection: cars and persons, by boxes"),
     ] = "segmentation",
     device: Annotated[
-        str, typer.Option(help="of the small network: cpu | cuda | cuda:1 | ...")
+        str, Option(help="of the small network: cpu | cuda | cuda:1 | ...")
     ] = "cpu",
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="print the plan and do nothing")
+        bool, Option("--dry-run", help="print the plan and do nothing")
     ] = False,
     **reading: Any,
 ) -> None:
@@ -185,7 +179,7 @@ def prove(
         plan, _ = make_plan(
             source, settings, minutes, jobs, tests=others, device=device
         )
-        typer.echo(describe(plan))
+        echo(describe(plan))
         return
     proof = run(
         source,
@@ -198,7 +192,7 @@ def prove(
         tests=others,
         device=device,
     )
-    typer.echo(f"{proof}\n\nThe page is {(out / 'index.html').resolve()}")
+    echo(f"{proof}\n\nThe page is {(out / 'index.html').resolve()}")
 
 
 def _check_task(task: str, further: dict[str, Any]) -> None:
@@ -226,8 +220,8 @@ def _prove_detection(
     settings = DetectionSettings(**given)
     if dry_run:
         work = DetectionWork(with_boxes(source), settings, out, out)
-        typer.echo(describe(work))
+        echo(describe(work))
         return
     values = prove_detection(source, out, settings, **options)
     page = (out / "index.html").resolve()
-    typer.echo(f"{format_table(values)}\n\nThe page is {page}")
+    echo(f"{format_table(values)}\n\nThe page is {page}")

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option, echo
 
 from lidar_synth.cli.options import Json
 from lidar_synth.errors import choose
@@ -15,32 +15,32 @@ from lidar_synth.errors import choose
 def recipes(
     name: Annotated[
         str | None,
-        typer.Argument(metavar="[NAME]", help="print the file of this recipe"),
+        Argument(metavar="[NAME]", help="print the file of this recipe"),
     ] = None,
     as_json: Json = False,
     trainer: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="print the files that a trainer needs for a mixture: mmdet3d | "
             "openpcdet | pointcept | rangenet | cylinder3d | open3d_ml | waffleiron | lightning"
         ),
     ] = None,
     task: Annotated[
         str | None,
-        typer.Option(help="of the trainer: segmentation | detection [what it can]"),
+        Option(help="of the trainer: segmentation | detection [what it can]"),
     ] = None,
     root: Annotated[
-        str, typer.Option(help="folder of the real scans, in the trainer's files")
+        str, Option(help="folder of the real scans, in the trainer's files")
     ] = "/data/scans",
     synthetic: Annotated[
-        str, typer.Option(help="bank, model or folder, in the trainer's files")
+        str, Option(help="bank, model or folder, in the trainer's files")
     ] = "/data/bank",
     out: Annotated[
-        Path | None, typer.Option(help="folder to write the trainer's files to")
+        Path | None, Option(help="folder to write the trainer's files to")
     ] = None,
     schema: Annotated[
         str | None,
-        typer.Option(help="print the JSON schema of: bake | distill | model | train"),
+        Option(help="print the JSON schema of: bake | distill | model | train"),
     ] = None,
 ) -> None:
     """Lists the recipes and the models of several stages of the package with data, size and
@@ -60,10 +60,10 @@ def recipes(
     if trainer is not None:
         _configure(trainer, task, root, synthetic, out)
     elif schema is not None:
-        typer.echo(json.dumps(_schema(schema), indent=1))
+        echo(json.dumps(_schema(schema), indent=1))
     elif name is not None:
         path = find_model_file(name) or find_recipe(name)
-        typer.echo(path.read_text(encoding="utf-8"), nl=False)
+        echo(path.read_text(encoding="utf-8"), nl=False)
     else:
         _list(as_json)
 
@@ -73,13 +73,13 @@ def _list(as_json: bool) -> None:
 
     listed = [*published_models(), *published()]
     if as_json:
-        typer.echo(json.dumps([asdict(one) for one in listed], indent=1))
+        echo(json.dumps([asdict(one) for one in listed], indent=1))
         return
     rows = [("recipe", "command", "data", "parameters", "time")]
     rows += [(one.name, one.command, one.data, one.size, one.time) for one in listed]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        typer.echo("  ".join(map(str.ljust, row, widths)).rstrip())
+        echo("  ".join(map(str.ljust, row, widths)).rstrip())
 
 
 def _schema(name: str) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def _configure(
     here = str((out or Path()).resolve())
     files = configure(trainer, task, settings, root, here)
     if out is None:
-        typer.echo("\n".join(f"# {name}\n{text}" for name, text in files.items()))
+        echo("\n".join(f"# {name}\n{text}" for name, text in files.items()))
         return
     write_files(files, out)
-    typer.echo("\n".join(f"{out / name}: written" for name in files))
+    echo("\n".join(f"{out / name}: written" for name in files))

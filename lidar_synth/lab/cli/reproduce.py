@@ -3,45 +3,45 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, BadParameter, Option, echo
 
 
 def reproduce(
     table: Annotated[
-        str, typer.Argument(metavar="TABLE", help="table1 to table6 of the paper")
+        str, Argument(metavar="TABLE", help="table1 to table6 of the paper")
     ],
     data: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="folder with KITTI-360 and SemanticKITTI, or one of them; by default "
             "KITTI360_ROOT and SEMANTICKITTI_ROOT"
         ),
     ] = None,
-    out: Annotated[
-        Path, typer.Option(help="folder of runs, scans and features")
-    ] = Path("runs/paper"),
+    out: Annotated[Path, Option(help="folder of runs, scans and features")] = Path(
+        "runs/paper"
+    ),
     use: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="TASK.STAGE=FILE",
             help="a checkpoint or released weights (.pth, .ckpt) instead of a training",
         ),
     ] = None,
     tenth: Annotated[
-        bool, typer.Option("--tenth", help="a tenth of the iterations and of the scans")
+        bool, Option("--tenth", help="a tenth of the iterations and of the scans")
     ] = False,
     tiny: Annotated[
         bool,
-        typer.Option("--tiny", help="small networks on scans of the town, in a minute"),
+        Option("--tiny", help="small networks on scans of the town, in a minute"),
     ] = False,
     estimate: Annotated[
         bool,
-        typer.Option("--estimate", help="print hours by stage, from a minute of each"),
+        Option("--estimate", help="print hours by stage, from a minute of each"),
     ] = False,
     weights: Annotated[
-        Path | None, typer.Option(help="folder with published weights of extractors")
+        Path | None, Option(help="folder with published weights of extractors")
     ] = None,
-    device: Annotated[str, typer.Option(help="device of sampling: cpu | cuda")] = "cpu",
+    device: Annotated[str, Option(help="device of sampling: cpu | cuda")] = "cpu",
 ) -> None:
     """Trains what a table needs (autoencoder, teacher, student on timesteps selected for it),
     generates, compares by the paper's protocol and prints the figures below the paper's.
@@ -61,7 +61,7 @@ def reproduce(
     from lidar_synth.lab.reproduce.work import TaskRun, find_data, write_town
 
     if tenth and tiny:
-        raise typer.BadParameter("give one of the two", param_hint="--tenth, --tiny")
+        raise BadParameter("give one of the two", param_hint="--tenth, --tiny")
     spec = find_table(table)
     scale = "tiny" if tiny else "tenth" if tenth else "full"
     folder = out / scale / "estimate" if estimate else out / scale
@@ -78,4 +78,4 @@ def reproduce(
     if not estimate:
         lines = report.reproduce(table, spec, works)
     for line in lines:
-        typer.echo(line)
+        echo(line)

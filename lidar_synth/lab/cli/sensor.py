@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option, Typer, echo
 
 from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 
@@ -15,21 +15,19 @@ if TYPE_CHECKING:
 def fit_from_scans(
     path: Annotated[
         Path,
-        typer.Argument(
-            metavar="PATH", help="file, folder or root of a dataset with scans"
-        ),
+        Argument(metavar="PATH", help="file, folder or root of a dataset with scans"),
     ],
     out: Annotated[
-        Path, typer.Option(help="YAML file to write, for --sensor of any command")
+        Path, Option(help="YAML file to write, for --sensor of any command")
     ],
     scans: Annotated[
-        int, typer.Option(min=1, max=20, help="number of scans to use, evenly spaced")
+        int, Option(min=1, max=20, help="number of scans to use, evenly spaced")
     ] = 8,
     columns: Annotated[
-        int | None, typer.Option(help="columns of the range images [from the firings]")
+        int | None, Option(help="columns of the range images [from the firings]")
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option(help="PNG file to write with a plot of the fit")
+        Path | None, Option(help="PNG file to write with a plot of the fit")
     ] = None,
     as_json: Json = False,
     **reading: Any,
@@ -71,13 +69,11 @@ def fit_from_scans(
 
         write_file(picture, lambda file: fit_figure(found).savefig(file, format="png"))
     if as_json:
-        typer.echo(
-            json.dumps({**_values(found), "sensor": found.sensor.to_dict()}, indent=1)
-        )
+        echo(json.dumps({**_values(found), "sensor": found.sensor.to_dict()}, indent=1))
         return
     for name, value in _values(found).items():
-        typer.echo(f"{name:<22}{value}")
-    typer.echo(f"{out}: written")
+        echo(f"{name:<22}{value}")
+    echo(f"{out}: written")
 
 
 def _values(found: "SensorFit") -> dict[str, object]:
@@ -121,7 +117,5 @@ def _values(found: "SensorFit") -> dict[str, object]:
     }
 
 
-sensor = typer.Typer(
-    name="sensor", help="Fits a sensor to scans.", no_args_is_help=True
-)
+sensor = Typer(name="sensor", help="Fits a sensor to scans.", no_args_is_help=True)
 sensor.command("fit")(fit_from_scans)

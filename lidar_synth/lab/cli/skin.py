@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option, Typer
 
 from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 
-skin = typer.Typer(
+skin = Typer(
     name="skin",
     help="The look of a real sensor's returns, for the town: fit, show.",
     no_args_is_help=True,
@@ -19,30 +19,28 @@ skin = typer.Typer(
 def fit_from_scans(
     scans: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="SCANS", help="real scans of one sensor, in any layout that is read"
         ),
     ],
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="file to write; its name ends in .skin")
+        Path, Option(metavar="FILE", help="file to write; its name ends in .skin")
     ],
-    licence: Annotated[
-        str, typer.Option(help="licence of the scans, which the file states")
-    ],
+    licence: Annotated[str, Option(help="licence of the scans, which the file states")],
     sensor: Annotated[
-        str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
+        str | None, Option(help="sensor of the scans: a preset or a YAML file")
     ] = None,
     most: Annotated[
-        int, typer.Option(min=5, help="number of scans to learn from, evenly spaced")
+        int, Option(min=5, help="number of scans to learn from, evenly spaced")
     ] = 100,
     streets: Annotated[
-        int, typer.Option(min=1, help="streets of the town that they are compared with")
+        int, Option(min=1, help="streets of the town that they are compared with")
     ] = 32,
     lasers: Annotated[
-        bool, typer.Option(help="give each laser its own offset of reflectance")
+        bool, Option(help="give each laser its own offset of reflectance")
     ] = False,
     seed: Annotated[
-        int, typer.Option(min=0, help="seed of the town that they are compared with")
+        int, Option(min=0, help="seed of the town that they are compared with")
     ] = 0,
     **reading: Any,
 ) -> None:
@@ -77,7 +75,7 @@ def fit_from_scans(
 @skin.command("show")
 def show(
     file: Annotated[
-        str, typer.Argument(metavar="SKIN", help="a shipped skin by name, or a file")
+        str, Argument(metavar="SKIN", help="a shipped skin by name, or a file")
     ],
     as_json: Json = False,
 ) -> None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option, echo
 
 from lidar_synth.cli.options import Reading, drop_missing, options_from
 
@@ -12,41 +12,37 @@ from lidar_synth.cli.options import Reading, drop_missing, options_from
 def start(
     root: Annotated[
         Path,
-        typer.Argument(
-            metavar="ROOT", help="scans in any layout, with labels or without"
-        ),
+        Argument(metavar="ROOT", help="scans in any layout, with labels or without"),
     ],
     out: Annotated[
-        Path, typer.Option(help="folder of all that is made, and needed to resume")
+        Path, Option(help="folder of all that is made, and needed to resume")
     ] = Path("start"),
     sensor: Annotated[
         str | None,
-        typer.Option(
-            help="sensor of the scans: a preset or a YAML file [known or fitted]"
-        ),
+        Option(help="sensor of the scans: a preset or a YAML file [known or fitted]"),
     ] = None,
     task: Annotated[
         str | None,
-        typer.Option(help="segmentation | detection [what the scans have labels for]"),
+        Option(help="segmentation | detection [what the scans have labels for]"),
     ] = None,
-    scans: Annotated[int, typer.Option(min=1, help="synthetic scans to make")] = 200,
+    scans: Annotated[int, Option(min=1, help="synthetic scans to make")] = 200,
     minutes: Annotated[
         float,
-        typer.Option(min=0, help="limit of the comparison with real scans; 0 = none"),
+        Option(min=0, help="limit of the comparison with real scans; 0 = none"),
     ] = 10.0,
     trainer: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="write its configuration too: mmdet3d | openpcdet | pointcept | "
             "rangenet | cylinder3d | open3d_ml | waffleiron | lightning"
         ),
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="processes [one for each core]")
+        int | None, Option(min=1, help="processes [one for each core]")
     ] = None,
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="say what lies there, the minutes and the disk"),
+        Option("--dry-run", help="say what lies there, the minutes and the disk"),
     ] = False,
     **reading: Any,
 ) -> None:
@@ -73,8 +69,8 @@ def start(
         trainer=trainer,
         jobs=jobs,
         dry_run=dry_run,
-        say=typer.echo,
+        say=echo,
         **drop_missing(reading),
     )
     if made is not None:
-        typer.echo(f"\n{made}")
+        echo(f"\n{made}")

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, BadParameter, Option, echo
 
 from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 
@@ -12,39 +12,35 @@ from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 def stress(
     scans: Annotated[
         Path,
-        typer.Argument(metavar="SCANS", help="labelled scans: a dataset or folder"),
+        Argument(metavar="SCANS", help="labelled scans: a dataset or folder"),
     ],
     model: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             metavar="[MODEL]",
             help="module:function | a folder of predictions | an archive of lidar-bonnetal | town",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="folder to which the corrupted scans are written"),
+        Option(help="folder to which the corrupted scans are written"),
     ] = None,
     corruptions: Annotated[
         str,
-        typer.Option(help="names, separated by commas; all [the benchmark's eight]"),
+        Option(help="names, separated by commas; all [the benchmark's eight]"),
     ] = "",
     baseline: Annotated[
         Path | None,
-        typer.Option(
-            help="another network's card (--json), for CE [MinkUNet-18's figures]"
-        ),
+        Option(help="another network's card (--json), for CE [MinkUNet-18's figures]"),
     ] = None,
     view: Annotated[
         Path | None,
-        typer.Option(
-            help="page (.html) or picture (.png) of the first scan, corrupted"
-        ),
+        Option(help="page (.html) or picture (.png) of the first scan, corrupted"),
     ] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="sensor of SCANS: a preset or a YAML file")
+        str | None, Option(help="sensor of SCANS: a preset or a YAML file")
     ] = None,
-    seed: Annotated[int, typer.Option(help="of the corruptions", min=0)] = 0,
+    seed: Annotated[int, Option(help="of the corruptions", min=0)] = 0,
     as_json: Json = False,
     **reading: Any,
 ) -> None:
@@ -76,7 +72,7 @@ def stress(
     from lidar_synth.weather import CORRUPTIONS
 
     if model is None and out is None:
-        raise typer.BadParameter("give MODEL, --out, or both", param_hint="MODEL")
+        raise BadParameter("give MODEL, --out, or both", param_hint="MODEL")
     if view is not None:
         view_suffix(view)
     names = robustness.NAMES_OF_BENCHMARK
@@ -87,7 +83,7 @@ def stress(
     if out is not None:
         require_outside(out, scans)
         written = robustness.write_cases(source, out, names, seed)
-        typer.echo(f"{out}: {written} scans written", err=True)
+        echo(f"{out}: {written} scans written", err=True)
     if model is None:
         return
     other = robustness.read_means(baseline) if baseline else robustness.BASELINE
@@ -96,4 +92,4 @@ def stress(
     if view is not None:
         notes = card.to_text().replace("\n", "\n\n")  # a paragraph for each row
         write_view(view, robustness.show_cases(source[0], names, seed), notes=notes)
-    typer.echo(json.dumps(card.to_dict(), indent=1) if as_json else card.to_text())
+    echo(json.dumps(card.to_dict(), indent=1) if as_json else card.to_text())

@@ -2,46 +2,44 @@
 
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from lidar_synth.cli.options import Out
 
 
 def town(
     out: Out,
-    scans: Annotated[int, typer.Option(help="number of scans")] = 200,
+    scans: Annotated[int, Option(help="number of scans")] = 200,
     seed: Annotated[
-        int, typer.Option(help="seed of the town: another seed is another town")
+        int, Option(help="seed of the town: another seed is another town")
     ] = 0,
     layout: Annotated[
-        str, typer.Option(help="folder layout: kitti360 | semantic_kitti | kitti")
+        str, Option(help="folder layout: kitti360 | semantic_kitti | kitti")
     ] = "kitti360",
     sensor: Annotated[
-        str, typer.Option(help="sensor that casts the rays: a preset or a YAML file")
+        str, Option(help="sensor that casts the rays: a preset or a YAML file")
     ] = "town",
     camera: Annotated[
-        bool, typer.Option(help="render a camera image of each scan (about 1 s each)")
+        bool, Option(help="render a camera image of each scan (about 1 s each)")
     ] = True,
-    interval: Annotated[
-        float, typer.Option(help="seconds between consecutive scans")
-    ] = 0.4,
+    interval: Annotated[float, Option(help="seconds between consecutive scans")] = 0.4,
     sequence: Annotated[
         int | None,
-        typer.Option(
+        Option(
             help="number of the drive or sequence to write [4 for kitti360, 0 for semantic_kitti]"
         ),
     ] = None,
     accumulate: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--accumulate",
             help="also write KITTI-360's accumulated clouds, for lidar-synth label",
         ),
     ] = False,
-    jobs: Annotated[int, typer.Option(help="number of worker processes")] = 1,
+    jobs: Annotated[int, Option(help="number of worker processes")] = 1,
     skin: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="look of a real sensor's returns: a shipped skin by name, or a .skin file"
         ),
     ] = None,

@@ -4,32 +4,30 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option, echo
 
 RecipeName = Annotated[
     str,
-    typer.Argument(
+    Argument(
         metavar="RECIPE",
         help="name of a recipe (see `lidar-synth recipes`), or a YAML file",
     ),
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[KEY=VALUE]...", help="values of the recipe to override"),
+    Argument(metavar="[KEY=VALUE]...", help="values of the recipe to override"),
 ]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="resume the run in the output folder")
-]
+Resume = Annotated[bool, Option("--resume", help="resume the run in the output folder")]
 Minutes = Annotated[
     float | None,
-    typer.Option(help="save and stop after this many minutes; --resume continues"),
+    Option(help="save and stop after this many minutes; --resume continues"),
 ]
 
 
 def train(
     recipe: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="RECIPE|MODEL",
             help=(
                 "name of a recipe or of a model of several stages (see `lidar-synth recipes`), "
@@ -41,7 +39,7 @@ def train(
     resume: Resume = False,
     minutes: Annotated[
         float | None,
-        typer.Option(
+        Option(
             help=(
                 "save and stop after this many minutes; --resume continues. Of a model: limit of "
                 "all stages"
@@ -50,10 +48,10 @@ def train(
     ] = None,
     until: Annotated[
         str | None,
-        typer.Option(metavar="STAGE", help="of a model: the last stage to run"),
+        Option(metavar="STAGE", help="of a model: the last stage to run"),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="of a model: print the time of each stage")
+        bool, Option("--dry-run", help="of a model: print the time of each stage")
     ] = False,
 ) -> None:
     """Trains a teacher, a rectified flow from noise to scans; or a model by all its stages.
@@ -91,7 +89,7 @@ def train(
     if find_model_file(recipe) is not None:
         plan = plan_model(recipe, overrides or (), minutes, until)
         if dry_run:
-            typer.echo(plan)
+            echo(plan)
         else:
             _print_once(train_model(plan))
         return
@@ -132,4 +130,4 @@ def distill(
 def _print_once(path: Path) -> None:
     """Print the checkpoint's path, in one of the processes of torchrun only."""
     if os.environ.get("RANK", "0") == "0":
-        typer.echo(path)
+        echo(path)
