@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 
+Floats = NDArray[np.float64]
+
 FARTHEST = 1.0
 """Maximum time in seconds before the first pose or after the last one for which a pose is
 extrapolated."""
 
 
-def interpolate_poses(
-    times: NDArray[np.float64], poses: NDArray[np.float64], at: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def interpolate_poses(times: Floats, poses: Floats, at: Floats) -> Floats:
     """The poses at other times: between two poses, velocity and angular velocity are constant.
 
     Before the first pose and after the last one, the motion of the nearest interval continues.
@@ -76,9 +76,7 @@ def interpolate_poses(
     return result
 
 
-def from_world(
-    points: NDArray[np.float64], poses: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def from_world(points: Floats, poses: Floats) -> Floats:
     """Points of the world in the frame of a pose each.
 
     Args:
@@ -95,8 +93,8 @@ def from_world(
 
 
 def _axes_and_angles(
-    rotations: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rotations: Floats,
+) -> tuple[Floats, Floats]:
     """(P, 3) unit axes and (P,) angles in [0, pi], radians, of (P, 3, 3) rotations between
     poses."""
     twice_sine = np.stack(
@@ -117,9 +115,7 @@ def _axes_and_angles(
     return twice_sine / np.maximum(length, 1e-300)[:, None], angles
 
 
-def _rotations(
-    axes: NDArray[np.float64], angles: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _rotations(axes: Floats, angles: Floats) -> Floats:
     """(N, 3, 3) rotations about unit axes by angles, by Rodrigues' formula."""
     cross = np.zeros((len(axes), 3, 3))
     cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0] = axes.T

@@ -34,6 +34,8 @@ from lidar_synth.mixing.quotas import (
 )
 from lidar_synth.mixing.schedules import share_of
 
+Integers = NDArray[np.int64]
+
 VERSION = "lidar-synth-plan/2"
 """Part of every plan's hash; changes when the same mixture gives another order."""
 
@@ -105,9 +107,7 @@ class MixingPlan:
             self._cache[block] = entries
         return int(entries[0][offset]), int(entries[1][offset])
 
-    def at(
-        self, positions: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def at(self, positions: Integers) -> tuple[Integers, Integers]:
         """The sources and local indices, (N,) each, of (N,) positions, 0 <= position < length."""
         rank = (
             self._balanced(positions)
@@ -123,12 +123,12 @@ class MixingPlan:
         return source, index
 
     @property
-    def source(self) -> NDArray[np.int64]:
+    def source(self) -> Integers:
         """(N,) the source at every position, computed on access."""
         return self.at(np.arange(len(self)))[0]
 
     @property
-    def index(self) -> NDArray[np.int64]:
+    def index(self) -> Integers:
         """(N,) the local index at every position, computed on access."""
         return self.at(np.arange(len(self)))[1]
 
@@ -166,19 +166,19 @@ class MixingPlan:
         ).hexdigest()
 
     @cached_property
-    def _starts(self) -> NDArray[np.int64]:
+    def _starts(self) -> Integers:
         """The first rank of each source."""
-        starts: NDArray[np.int64] = np.cumsum((0, *self.counts[:-1]), dtype=np.int64)
+        starts: Integers = np.cumsum((0, *self.counts[:-1]), dtype=np.int64)
         return starts
 
     @cached_property
-    def _cache(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def _cache(self) -> dict[int, tuple[Integers, Integers]]:
         return {}
 
-    def _shuffled(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _shuffled(self, positions: Integers) -> Integers:
         return permute(positions, len(self), self.mixture.seed, _ORDER, self.epoch)
 
-    def _balanced(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _balanced(self, positions: Integers) -> Integers:
         """Ranks with synthetic samples spread evenly over the epoch, and synthetic sources among
         them."""
         before = self._synthetic_up_to(positions)
@@ -192,7 +192,7 @@ class MixingPlan:
             rank[synthetic] = self._deal(before[synthetic])
         return rank
 
-    def _deal(self, before: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _deal(self, before: Integers) -> Integers:
         """Ranks of synthetic samples, from the number of those before each in the epoch."""
         earlier = sum(self.before[self.reals :])
         source, number = deal(self.mixture.synthetic_weights, before + earlier)
@@ -204,7 +204,7 @@ class MixingPlan:
             rank[here] = start + self._ordered(total, own)
         return rank
 
-    def _ordered(self, source: int, own: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _ordered(self, source: int, own: Integers) -> Integers:
         """The order of a synthetic source's samples in the epoch; blocks begin at multiples of
         their size."""
         count = self.counts[source]
@@ -217,7 +217,7 @@ class MixingPlan:
             permute_blocks(own, count, block, *key) + int(-first[0]) % block
         ) % count
 
-    def _synthetic_up_to(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _synthetic_up_to(self, positions: Integers) -> Integers:
         """Number of synthetic samples among the first ``positions`` of the epoch: the exact number,
         rounded up.
 
@@ -230,7 +230,7 @@ class MixingPlan:
         ahead = floor((ceil(exact) - exact) * q)
         return -((ahead - positions * p) // q)
 
-    def _local(self, source: int, number: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _local(self, source: int, number: Integers) -> Integers:
         """The local indices of a source's running numbers."""
         mixture = self.mixture
         if source < self.reals:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.viz.scales import EMPTY, Rgb, Scale, make_scales, point_values
 
+Floats = NDArray[np.float32]
+
 SAMPLES = 2
 """Samples per pixel along each axis, averaged for antialiasing."""
 
@@ -50,7 +52,7 @@ class Camera:
 
     def look(
         self, points: NDArray[np.floating], size: tuple[int, int]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[Floats, Floats, Floats]:
         """Project points (N, 3) into a picture of ``size`` (width, height) pixels.
 
         Returns:
@@ -113,12 +115,12 @@ def bird(extent: float = 50.0) -> Camera:
 
 
 def _splat(
-    pixels: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    radius: NDArray[np.float32],
+    pixels: Floats,
+    depth: Floats,
+    radius: Floats,
     colours: Rgb,
     size: tuple[int, int],
-) -> tuple[Rgb, NDArray[np.float32]]:
+) -> tuple[Rgb, Floats]:
     """Picture (h, w, 3) and depth buffer (h, w), inf = empty, of points drawn as discs; the nearest
     disc wins."""
     width, height = size
@@ -148,7 +150,7 @@ def _splat(
     return picture.reshape(height, width, 3), buffer.reshape(height, width)
 
 
-def _shade(picture: Rgb, buffer: NDArray[np.float32], strength: float = 40.0) -> Rgb:
+def _shade(picture: Rgb, buffer: Floats, strength: float = 40.0) -> Rgb:
     """Eye-dome lighting: darken a pixel by the log-depth differences to neighbours in front of
     it."""
     filled = np.isfinite(buffer)
@@ -171,7 +173,7 @@ def _shade(picture: Rgb, buffer: NDArray[np.float32], strength: float = 40.0) ->
 
 def _lines(
     picture: Rgb,
-    buffer: NDArray[np.float32],
+    buffer: Floats,
     segments: NDArray[np.floating],
     camera: Camera,
     colour: tuple[int, int, int],
@@ -229,7 +231,7 @@ EDGES = np.array(
 """The 12 edges of a box, as indices of ``Boxes.corners``."""
 
 
-def box_segments(boxes: Boxes) -> NDArray[np.float32]:
+def box_segments(boxes: Boxes) -> Floats:
     """(13 M, 2, 3) edges of the boxes, and for each box a line on its top from the centre to the
     front."""
     corners = boxes.corners()
@@ -241,7 +243,7 @@ def box_segments(boxes: Boxes) -> NDArray[np.float32]:
     )
 
 
-def ring_segments(scan: Scan) -> NDArray[np.float32]:
+def ring_segments(scan: Scan) -> Floats:
     """(S, 2, 3) circles on the ground every 10 m, which show distances."""
     near = scan.points[np.linalg.norm(scan.points[:, :2], axis=1) < 20, 2]
     ground = float(np.percentile(near, 5)) if len(near) else 0.0

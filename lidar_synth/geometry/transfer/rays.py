@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
 
+Floats = NDArray[np.float64]
+
 
 class Rays(NamedTuple):
     """H lasers with F firings each. Laser h fires at azimuth ``first[h] + f * step`` for f = 0 .. F
@@ -22,18 +24,18 @@ class Rays(NamedTuple):
         directions: (H, F, 2) x and y of each ray's direction, per unit of horizontal distance.
     """
 
-    slope: NDArray[np.float64]
-    height: NDArray[np.float64]
-    first: NDArray[np.float64]
+    slope: Floats
+    height: Floats
+    first: Floats
     step: float
     firings: int
-    directions: NDArray[np.float64]
+    directions: Floats
 
 
 def rays_from(
-    slope: NDArray[np.float64],
-    height: NDArray[np.float64],
-    first: NDArray[np.float64],
+    slope: Floats,
+    height: Floats,
+    first: Floats,
     firings: int,
 ) -> Rays:
     """The rays of H lasers (H,) with F firings each, see ``Rays``."""

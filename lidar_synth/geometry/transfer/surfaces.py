@@ -20,6 +20,8 @@ from lidar_synth.geometry.transfer.kernels import (
     triangulate,
 )
 
+Integers = NDArray[np.int64]
+
 ORDERED = np.radians(2.0)
 """Half of the steps of azimuth between successive points of a file that may be in ring order are
 smaller, radians."""
@@ -128,7 +130,7 @@ def estimate(scan: Scan) -> ScanSurfaces:
     return ScanSurfaces(scan, azimuth, triangles, rim, level, step, up, down, bounds)
 
 
-def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
+def rings_of(scan: Scan) -> tuple[Integers, bool]:
     """(N,) ring of each return, 0 = highest, and whether rings are rows of a grid, which may lack
     returns of a row.
 
@@ -188,12 +190,12 @@ def _elevations(scan: Scan) -> NDArray[np.float32]:
     return np.arcsin(np.clip(sine, -1, 1))
 
 
-def _row(elevation: NDArray[np.float32], sensor: Sensor) -> NDArray[np.int64]:
+def _row(elevation: NDArray[np.float32], sensor: Sensor) -> Integers:
     """(N,) row of a sensor's grid at each elevation (N,), radians."""
     return np.searchsorted(-sensor.edges[1:-1], -elevation)
 
 
-def _rows_of(scan: Scan) -> NDArray[np.int64]:
+def _rows_of(scan: Scan) -> Integers:
     """(N,) row of each return; of those outside the sensor's range limits too."""
     endless = replace(scan.sensor, range_min=0.0, range_max=1e6)
     cell = locate(scan.points.astype(np.float32), endless).cell
@@ -212,7 +214,7 @@ def _check(scan: Scan) -> None:
 def _check_rings(
     scan: Scan,
     elevation: NDArray[np.float32],
-    starts: NDArray[np.int64],
+    starts: Integers,
     middle: NDArray[np.float64],
 ) -> None:
     """Refuse points that do not lie on rings, such as those of a map."""
@@ -229,9 +231,7 @@ def _check_rings(
         )
 
 
-def _step(
-    azimuth: NDArray[np.float64], starts: NDArray[np.int64], sensor: Sensor
-) -> float:
+def _step(azimuth: NDArray[np.float64], starts: Integers, sensor: Sensor) -> float:
     """Radians between two firings: the sensor's own, or the lower quartile between neighbours along
     a ring."""
     if sensor.firings is not None:
@@ -243,7 +243,7 @@ def _step(
     return float(min(np.percentile(turn, 25) if len(turn) else nominal, 1.5 * nominal))
 
 
-def _objects(scan: Scan) -> NDArray[np.int64]:
+def _objects(scan: Scan) -> Integers:
     """(N,) a number for each pair of label and instance."""
     key: Any = np.zeros(len(scan), np.int64)
     if scan.label is not None:

@@ -23,6 +23,8 @@ from tqdm import tqdm
 
 from lidar_synth.noise import keyed_rng
 
+Integers = NDArray[np.int64]
+
 DIMENSIONS = 64
 """Dimensions of a sketch."""
 
@@ -69,7 +71,7 @@ class Signatures(Protocol):
 
 def find_similar(
     signatures: Signatures, progress: bool = True
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.float64], Integers]:
     """For each signature, approximately the most similar earlier one; like ``most_similar``.
 
     Returns:
@@ -105,7 +107,7 @@ def _parts(count: int, size: int | None = None) -> Iterator[slice]:
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
-def _first_copies(signatures: Signatures) -> NDArray[np.int64]:
+def _first_copies(signatures: Signatures) -> Integers:
     """(N,) number of the first signature with the same bytes."""
     hashes = np.empty(len(signatures), np.uint64)
     for part in _parts(len(signatures)):
@@ -120,14 +122,14 @@ def _first_copies(signatures: Signatures) -> NDArray[np.int64]:
     return first[group]
 
 
-def _sketches(signatures: Signatures, own: NDArray[np.int64]) -> NDArray[np.int8]:
+def _sketches(signatures: Signatures, own: Integers) -> NDArray[np.int8]:
     """(len(own), DIMENSIONS) the sketches of some signatures."""
     width = signatures[:1].shape[1]
     signs = keyed_rng(width, DIMENSIONS).choice(
         np.array([-1, 1], np.float32), (width, DIMENSIONS)
     )
 
-    def project(rows: NDArray[np.int64]) -> NDArray[np.float32]:
+    def project(rows: Integers) -> NDArray[np.float32]:
         values: NDArray[np.float32] = (
             np.rint(signatures[rows].astype(np.float32) * _STEPS) @ signs
         )
@@ -179,9 +181,7 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32
     return best.astype(np.int32)
 
 
-def _by_cell(
-    of: NDArray[np.unsignedinteger], cells: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _by_cell(of: NDArray[np.unsignedinteger], cells: int) -> tuple[Integers, Integers]:
     """Numbers of the sketches, sorted by cell and then ascending; start of each cell in this list,
     and its end."""
     order = np.argsort(of, kind="stable")
@@ -190,8 +190,8 @@ def _by_cell(
 
 def _compare(
     sketches: NDArray[np.int8],
-    queries: NDArray[np.int64],
-    members: NDArray[np.int64],
+    queries: Integers,
+    members: Integers,
     best: NDArray[np.float64],
 ) -> None:
     """Update the best candidates of each query with the earlier members of a cell."""
@@ -203,7 +203,7 @@ def _compare(
 
 
 def _keys(
-    some: NDArray[np.int8], others: NDArray[np.int8], numbers: NDArray[np.int64]
+    some: NDArray[np.int8], others: NDArray[np.int8], numbers: Integers
 ) -> NDArray[np.float64]:
     """(M, N) sort keys: the squared distance of two sketches first, then the number of the second
     sketch."""
@@ -217,8 +217,8 @@ def _keys(
 
 
 def _best(
-    signatures: Signatures, part: slice, found: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    signatures: Signatures, part: slice, found: Integers
+) -> tuple[NDArray[np.float64], Integers]:
     """Similarity and number of the most similar of the candidates (M, K) of each signature; the
     first one of equals."""
     found = np.sort(found, 1)

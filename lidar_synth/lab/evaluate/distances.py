@@ -8,6 +8,8 @@ from scipy.special import rel_entr
 
 from lidar_synth.errors import DataError
 
+Floats = NDArray[np.float64]
+
 
 def jensen_shannon_distance(p: NDArray[np.number], q: NDArray[np.number]) -> float:
     """Square root of the Jensen-Shannon divergence (natural logarithm), in [0, sqrt(log 2)]; LiDM
@@ -57,10 +59,10 @@ def frechet_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
 
 
 def frechet_of_moments(
-    mean_a: NDArray[np.float64],
-    cov_a: NDArray[np.float64],
-    mean_b: NDArray[np.float64],
-    cov_b: NDArray[np.float64],
+    mean_a: Floats,
+    cov_a: Floats,
+    mean_b: Floats,
+    cov_b: Floats,
 ) -> float:
     """As ``frechet_distance``, from means (D,) and covariances (D, D)."""
     values, vectors = np.linalg.eigh(cov_a)
@@ -118,7 +120,7 @@ def squared_mmd(
 
 def checked_features(
     a: NDArray[np.floating], b: NDArray[np.floating]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """(N, D) and (M, D) features in float64.
 
     Raises:

@@ -20,6 +20,8 @@ from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.objects import Object, instances_of, objects_of
 
+Floats = NDArray[np.float64]
+
 CLASSES = {"car": LABELS["Car"], "person": LABELS["Pedestrian"]}
 """Train ids of the judged classes."""
 LEAST = 20
@@ -64,7 +66,7 @@ class Crop:
     roof: float
     side: float
     rough: float
-    features: Mapping[str, NDArray[np.float64]]
+    features: Mapping[str, Floats]
 
 
 def crop(found: Object, place: str) -> Crop:
@@ -101,13 +103,13 @@ def crop(found: Object, place: str) -> Crop:
     return Crop(place, distance, width, count, roof, side, rough, features)
 
 
-def _median(values: NDArray[np.float64]) -> float:
+def _median(values: Floats) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
 def _surfaces(
-    points: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    points: Floats,
+) -> tuple[Floats, Floats]:
     """(N,) how upright the normal of the neighbours of each point is, 0 to 1; (N,) distance of the
     point from their plane, metres."""
     _, near = KDTree(points).query(points, min(NEIGHBOURS, len(points)))
@@ -171,7 +173,7 @@ def match(real: Sequence[Crop], fake: Sequence[Crop]) -> list[tuple[Crop, Crop]]
     return matched
 
 
-def _seen(side: Sequence[Crop]) -> NDArray[np.float64]:
+def _seen(side: Sequence[Crop]) -> Floats:
     return np.array([(np.log(c.distance) / NEAR, c.width / WIDE) for c in side])
 
 
@@ -200,7 +202,7 @@ def separate(
     return float(np.average(areas, weights=weights)) if areas else None
 
 
-def _area(known: NDArray[np.float64], asked: NDArray[np.float64]) -> float:
+def _area(known: Floats, asked: Floats) -> float:
     """The area under the ROC curve at pairs (2 M, D) of a classifier that knows (2 N, D): ridge
     regression of the side on the features and their squares."""
     mean = known.mean(0)
@@ -216,14 +218,12 @@ def _area(known: NDArray[np.float64], asked: NDArray[np.float64]) -> float:
     return float(((above > 0) + (above == 0) / 2).mean())
 
 
-def _with_squares(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def _with_squares(rows: Floats) -> Floats:
     rows = np.clip(rows, -FARTHEST, FARTHEST)
     return np.concatenate([rows, rows**2], 1)
 
 
-def _rows(
-    pairs: Sequence[tuple[Crop, Crop]], groups: Sequence[str]
-) -> NDArray[np.float64]:
+def _rows(pairs: Sequence[tuple[Crop, Crop]], groups: Sequence[str]) -> Floats:
     """(2 N, D) features of the first objects, then of the second ones."""
     crops = [pair[side].features for side in (0, 1) for pair in pairs]
     return np.array([np.concatenate([c[name] for name in groups]) for c in crops])

@@ -29,6 +29,8 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.labels import require_label
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
 
+Integers = NDArray[np.int64]
+
 FORMAT = "lidar-synth-segmenter/1"
 
 Images = Mapping[str, Tensor]
@@ -38,7 +40,7 @@ Images = Mapping[str, Tensor]
 
 def confusion(
     network: nn.Module, batches: Iterable[Images], height: Tensor
-) -> NDArray[np.int64]:
+) -> Integers:
     """(19, 19) number of cells by label (row) and prediction (column), without ignored cells."""
     table = np.zeros((len(NAMES), len(NAMES)), np.int64)
     with torch.inference_mode():
@@ -53,7 +55,7 @@ def tabulate(
     label: NDArray[np.uint8],
     predicted: NDArray[np.integer],
     columns: int = len(NAMES),
-) -> NDArray[np.int64]:
+) -> Integers:
     """(19, columns) number of elements by label (row) and prediction (column), without ignored
     ones; the arrays have one shape."""
     valid = label != IGNORE
@@ -62,7 +64,7 @@ def tabulate(
     return counts.reshape(len(NAMES), columns)
 
 
-def class_ious(table: NDArray[np.int64]) -> NDArray[np.float64]:
+def class_ious(table: Integers) -> NDArray[np.float64]:
     """(19,) intersection over union of every class; NaN for a class that is neither labelled nor
     predicted.
 
@@ -74,7 +76,7 @@ def class_ious(table: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.where(union > 0, hit / np.maximum(union, 1), np.nan)
 
 
-def mean_iou(table: NDArray[np.int64]) -> float:
+def mean_iou(table: Integers) -> float:
     """Mean of ``class_ious`` over the classes that occur in the labels, in [0, 1].
 
     Raises:
@@ -114,7 +116,7 @@ class Judge:
             inputs = segmenter_input(batch["range"], batch["reflectance"], self.height)
             return self.network.features(inputs).double().numpy()
 
-    def agreement(self, scans: Iterable[Scan]) -> NDArray[np.int64]:
+    def agreement(self, scans: Iterable[Scan]) -> Integers:
         """(19, 19) number of cells by the scans' labels (row) and the network's prediction
         (column).
 

@@ -19,6 +19,7 @@ from lidar_synth.lab.evaluate.distances import (
     jensen_shannon_distance,
 )
 
+Floats = NDArray[np.float64]
 Counts = NDArray[np.integer[Any]]
 
 _BLOCK = 1000  # samples compared with one another at a time: 4 MB of kernel values in float32
@@ -33,7 +34,7 @@ class Statistic(NamedTuple):
         sizes: (N, M).
     """
 
-    at: Callable[[Counts, Counts], NDArray[np.float64]]
+    at: Callable[[Counts, Counts], Floats]
     sizes: tuple[int, int]
 
     @property
@@ -72,7 +73,7 @@ def sparse_histogram_distance(
     place = np.cumsum(filled, dtype=np.int32) - 1
     used = int(filled.sum())
 
-    def at(a: Counts, b: Counts) -> NDArray[np.float64]:
+    def at(a: Counts, b: Counts) -> Floats:
         sums = (
             (_sum(real, p, place, used), _sum(fake, q, place, used))
             for p, q in zip(a, b, strict=True)
@@ -137,7 +138,7 @@ def gaussian_mmd(
         squared = own[:, None] + q.square().sum(1) - 2 * p @ q.T
         return torch.expm1(-2 * squared.clamp_(min=0))
 
-    def at(a: Counts, b: Counts) -> NDArray[np.float64]:
+    def at(a: Counts, b: Counts) -> Floats:
         mean = [
             _mean_kernel(less_one, *pair, block)
             for pair in ((real, a, real, a), (fake, b, fake, b), (real, a, fake, b))
@@ -154,7 +155,7 @@ def _mean_kernel(
     q: Rows,
     b: Counts,
     size: int,
-) -> NDArray[np.float64]:
+) -> Floats:
     """(R,) mean of the kernel over all pairs, by the counts (R, N) and (R, M); ``size`` samples at
     a time."""
     left, right = (torch.from_numpy(np.asarray(c, np.float32)) for c in (a, b))
@@ -187,7 +188,7 @@ def frechet(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Statistic
     """
     sets = checked_features(real, fake)
 
-    def at(a: Counts, b: Counts) -> NDArray[np.float64]:
+    def at(a: Counts, b: Counts) -> Floats:
         return np.array(
             [
                 frechet_of_moments(*_moments(sets[0], p), *_moments(sets[1], q))
@@ -198,9 +199,7 @@ def frechet(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Statistic
     return Statistic(at, (len(sets[0]), len(sets[1])))
 
 
-def _moments(
-    features: NDArray[np.float64], counts: Counts
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _moments(features: Floats, counts: Counts) -> tuple[Floats, Floats]:
     kept = counts > 0
     features = features[kept]
     counts = counts[kept]
@@ -227,7 +226,7 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
     def kernel(p: Tensor, q: Tensor) -> Tensor:
         return (p @ q.T / x.shape[1] + 1) ** 3
 
-    def within(k: int, counts: Counts) -> NDArray[np.float64]:
+    def within(k: int, counts: Counts) -> Floats:
         pairs = counts.sum(1).astype(np.float64) ** 2
         own = counts.astype(np.float64) ** 2
         total = (
@@ -238,7 +237,7 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(total / (pairs - own.sum(1)))
 
-    def at(a: Counts, b: Counts) -> NDArray[np.float64]:
+    def at(a: Counts, b: Counts) -> Floats:
         return (
             within(0, a)
             + within(1, b)
@@ -256,7 +255,7 @@ def smallest_of_pairs(distances: NDArray[np.floating]) -> Statistic:
         distances: (N, M) of every pair.
     """
 
-    def at(a: Counts, b: Counts) -> NDArray[np.float64]:
+    def at(a: Counts, b: Counts) -> Floats:
         values = []
         for p, q in zip(a, b, strict=True):
             nearest = distances[:, q > 0].min(1).astype(np.float64)
@@ -277,7 +276,7 @@ def share(hits: NDArray[np.floating], of_real: bool, other: int) -> Statistic:
         other: number of samples of the other set.
     """
 
-    def at(a: Counts, b: Counts) -> NDArray[np.float64]:
+    def at(a: Counts, b: Counts) -> Floats:
         counts = a if of_real else b
         return np.asarray(counts @ hits / counts.sum(1))
 

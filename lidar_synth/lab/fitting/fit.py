@@ -19,6 +19,7 @@ from lidar_synth.lab.fitting.lost_beams import add_lost_beams
 from lidar_synth.lab.fitting.model import Cloud, Model
 from lidar_synth.lab.fitting.points import follows_time
 
+Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 SCANS = 20
@@ -80,7 +81,7 @@ class SensorFit:
     """
 
     sensor: Sensor
-    points: NDArray[np.int64]
+    points: Integers
     spread: Floats
     within: Floats
     mount: Floats
@@ -234,8 +235,8 @@ def _described(
 def _by_ring(
     measure: Callable[[NDArray[Any]], Any],
     values: NDArray[Any],
-    ring: NDArray[np.int64],
-    number: NDArray[np.int64],
+    ring: Integers,
+    number: Integers,
 ) -> Floats:
     """(R,) a measure of the values of each ring, which has ``number`` of them; 0 without any."""
     parts = np.split(values[np.argsort(ring, kind="stable")], np.cumsum(number)[:-1])
@@ -262,7 +263,7 @@ def _highest_first(model: Model) -> Model:
     return Model(tangents, heights, offset, model.turn, model.motion)
 
 
-def _check(model: Model, ring: NDArray[np.int64], off: Floats) -> None:
+def _check(model: Model, ring: Integers, off: Floats) -> None:
     """Refuse beams that are none.
 
     Raises:
@@ -287,7 +288,7 @@ def _azimuths(
     scans: Sequence[Scan],
     cloud: Cloud,
     points: Floats,
-    ring: NDArray[np.int64],
+    ring: Integers,
     rows: int,
 ) -> Azimuths:
     turns = []

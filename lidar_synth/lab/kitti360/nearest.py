@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+Floats = NDArray[np.float32]
+
 VOXEL = 0.05
 """Side of the cubes in which points of one class are reduced to one point, metres."""
 
@@ -32,9 +34,9 @@ class Vote(NamedTuple):
     """
 
     value: NDArray[np.uint32]
-    share: NDArray[np.float32]
-    trust: NDArray[np.float32]
-    distance: NDArray[np.float32]
+    share: Floats
+    trust: Floats
+    distance: Floats
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,9 @@ class NearestLabels:
     """
 
     low: NDArray[np.float64]
-    points: NDArray[np.float32]
+    points: Floats
     values: NDArray[np.uint32]
-    confidence: NDArray[np.float32]
+    confidence: Floats
     tree: cKDTree
 
     def __len__(self) -> int:
@@ -101,7 +103,7 @@ class NearestLabels:
         return np.where(np.isfinite(distance), found, -1), distance
 
 
-Chunk = tuple[NDArray[np.floating], NDArray[np.uint32], NDArray[np.float32]]
+Chunk = tuple[NDArray[np.floating], NDArray[np.uint32], Floats]
 """Points (N, 3), label values (N,) and confidence (N,)."""
 
 
@@ -130,10 +132,10 @@ def index_cloud(
 
 
 def _thin(
-    points: NDArray[np.float32],
+    points: Floats,
     values: NDArray[np.uint32],
-    confidence: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.float32]]:
+    confidence: Floats,
+) -> tuple[Floats, NDArray[np.uint32], Floats]:
     """Points sorted by their cubes and classes, the first of each."""
     places = np.column_stack([points / VOXEL, values % _CLASSES]).astype(np.int64)
     keys = np.ravel_multi_index(places.T, places.max(axis=0, initial=0) + 1)

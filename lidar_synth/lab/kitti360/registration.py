@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.lab.kitti360.nearest import NearestLabels, index_cloud
 
+Floats = NDArray[np.float64]
+
 _SIDE = 0.5  # metres, of a cube
 _FEWEST = 6  # points of a cube that show its shape
 _THIN = 0.08  # metres, standard deviation up to which a cube says where points lie
@@ -48,13 +50,13 @@ class SurfaceMap:
     """
 
     index: NearestLabels
-    means: NDArray[np.float64]
-    axes: NDArray[np.float64]
-    origin: NDArray[np.float64]
+    means: Floats
+    axes: Floats
+    origin: Floats
 
     def residuals(
-        self, points: NDArray[np.float64], radius: float
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        self, points: Floats, radius: float
+    ) -> tuple[NDArray[np.intp], Floats]:
         """The points (of N, 3) with a cube, as (K,) indices, and (K, 3, 4): the scaled axes, and
         the residual."""
         found = self.index.nearest(points, radius, 1)[0][:, 0]
@@ -101,7 +103,7 @@ def find_surfaces(cloud: NearestLabels) -> SurfaceMap:
     return SurfaceMap(index, means, scaled, cloud.low)
 
 
-def register(points: NDArray[np.float64], surfaces: SurfaceMap) -> NDArray[np.float64]:
+def register(points: Floats, surfaces: SurfaceMap) -> Floats:
     """(4, 4) the transform in the world that lays points (N, 3) onto surfaces; the identity if it
     gains too little."""
     given = np.eye(4)
@@ -120,11 +122,11 @@ def register(points: NDArray[np.float64], surfaces: SurfaceMap) -> NDArray[np.fl
 
 
 def _descend(
-    transform: NDArray[np.float64],
-    points: NDArray[np.float64],
+    transform: Floats,
+    points: Floats,
     surfaces: SurfaceMap,
     radii: tuple[float, ...],
-) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+) -> tuple[Floats, Floats | None]:
     """The transform after some steps, and its (6, 6) certainty, translation first; None without
     enough points."""
     centre = points.mean(axis=0)
@@ -150,9 +152,7 @@ def _descend(
     return transform, certain
 
 
-def _score(
-    transform: NDArray[np.float64], points: NDArray[np.float64], surfaces: SurfaceMap
-) -> float:
+def _score(transform: Floats, points: Floats, surfaces: SurfaceMap) -> float:
     return float(
         _robust(
             surfaces.residuals(apply(transform, points), _CLOSE[0])[1][:, :, 3],
@@ -161,24 +161,20 @@ def _score(
     )
 
 
-def _robust(off: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+def _robust(off: Floats, scale: float) -> Floats:
     """The weights of Geman and McClure for residuals (K, 3)."""
     squared = (off**2).sum(axis=1)
-    weights: NDArray[np.float64] = (1 + squared / scale**2) ** -2
+    weights: Floats = (1 + squared / scale**2) ** -2
     return weights
 
 
-def apply(
-    transform: NDArray[np.float64], points: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def apply(transform: Floats, points: Floats) -> Floats:
     """Points (N, 3) moved by a (4, 4) transform."""
-    moved: NDArray[np.float64] = points @ transform[:3, :3].T + transform[:3, 3]
+    moved: Floats = points @ transform[:3, :3].T + transform[:3, 3]
     return moved
 
 
-def _small(
-    step: NDArray[np.float64], centre: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _small(step: Floats, centre: Floats) -> Floats:
     """(4, 4) a translation and a small rotation vector about a point, made orthogonal."""
     x, y, z = step[3:]
     turned, _, back = np.linalg.svd(
@@ -190,5 +186,5 @@ def _small(
     return transform
 
 
-def _sums(values: NDArray[np.float32], starts: NDArray[np.intp]) -> NDArray[np.float64]:
+def _sums(values: NDArray[np.float32], starts: NDArray[np.intp]) -> Floats:
     return np.asarray(np.add.reduceat(values, starts, axis=0, dtype=np.float64))

@@ -21,6 +21,8 @@ from lidar_synth.lab.proof.scores import (
 from lidar_synth.lab.proof.trial import LOOKS, TrialOutcome
 from lidar_synth.lab.town.returns import CALIBRATED_ON
 
+Floats = NDArray[np.float64]
+
 Results = dict[Pair, dict[Row, TrialOutcome]]
 """{pair: {arm: outcome}} of the complete pairs."""
 
@@ -147,7 +149,7 @@ def _scores(
     row: Row,
     places: Sequence[str],
     seeds: Sequence[int],
-) -> NDArray[np.float64]:
+) -> Floats:
     """(P, S) mIoU in per cent; NaN where there is no training."""
     scores = np.full((len(places), len(seeds)), np.nan)
     for (place, seed), outcomes in found.items():
@@ -156,14 +158,12 @@ def _scores(
     return scores
 
 
-def _mean(values: NDArray[np.float64]) -> float:
+def _mean(values: Floats) -> float:
     """The mean over places of the means over seeds."""
     return float(np.nanmean(np.nanmean(values, 1)))
 
 
-def _interval(
-    plan: ProofPlan, differences: NDArray[np.float64]
-) -> tuple[float, float] | None:
+def _interval(plan: ProofPlan, differences: Floats) -> tuple[float, float] | None:
     return interval(differences, shared=plan.training is not None)
 
 
@@ -171,8 +171,8 @@ def _arm(
     plan: ProofPlan,
     found: Results,
     row: Row,
-    scores: Mapping[Row, NDArray[np.float64]],
-    base: NDArray[np.float64],
+    scores: Mapping[Row, Floats],
+    base: Floats,
     preparation: float,
     places: Sequence[str],
 ) -> dict[str, Any]:
@@ -253,7 +253,7 @@ def _curve(
 
 
 def _chosen_elsewhere(
-    plan: ProofPlan, scores: Mapping[Row, NDArray[np.float64]]
+    plan: ProofPlan, scores: Mapping[Row, Floats]
 ) -> dict[str, Any] | None:
     """The gain in each place of the arm with synthetic scans that is best in the other places."""
     base = scores[plan.rows[0]]
@@ -275,7 +275,7 @@ def _chosen_elsewhere(
 
 
 def _over_best_real(
-    plan: ProofPlan, scores: Mapping[Row, NDArray[np.float64]]
+    plan: ProofPlan, scores: Mapping[Row, Floats]
 ) -> dict[str, Any] | None:
     """The best arm with synthetic scans against the best arm with real scans only and as many
     iterations."""

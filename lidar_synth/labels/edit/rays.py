@@ -10,6 +10,8 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer.kernels import WIDEST
 from lidar_synth.geometry.transfer.surfaces import as_fired, rings_of
 
+Floats = NDArray[np.float64]
+
 
 class ScanRays(NamedTuple):
     """E rays, ordered by ring and clockwise within a ring; the last of a ring is followed by its
@@ -28,16 +30,14 @@ class ScanRays(NamedTuple):
 
     point: NDArray[np.int64]
     ring: NDArray[np.int64]
-    azimuth: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    height: NDArray[np.float64]
-    rho: NDArray[np.float64]
+    azimuth: Floats
+    slope: Floats
+    height: Floats
+    rho: Floats
     start: NDArray[np.int64]
     step: float
 
-    def points(
-        self, which: NDArray[np.intp], rho: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
+    def points(self, which: NDArray[np.intp], rho: Floats) -> NDArray[np.float32]:
         """(n, 3) points on some rays at horizontal distances (n,), metres."""
         azimuth = self.azimuth[which]
         z = self.height[which] + self.slope[which] * rho
@@ -52,7 +52,7 @@ class ScanRays(NamedTuple):
         wide = box + np.array([0, 0, 0, *sides, 0], np.float32)
         return np.asarray(self.leaving(wide) > 0)
 
-    def leaving(self, box: NDArray[np.float32]) -> NDArray[np.float64]:
+    def leaving(self, box: NDArray[np.float32]) -> Floats:
         """(E,) horizontal distance at which each ray leaves a box (7,), metres; 0 = it does not
         pass through."""
         left = np.zeros(len(self.azimuth))

@@ -19,6 +19,8 @@ from torch import Tensor
 
 from lidar_synth.lab.proof.detection.boxes import CLASSES
 
+Floats = NDArray[np.float32]
+
 REACH = 51.2
 """Metres from the sensor to each of the four sides of the view."""
 CELL = 0.2
@@ -57,14 +59,14 @@ class Target(NamedTuple):
 class Found:
     """Detected boxes: (D, 7) boxes as ``Boxes.values``, (D,) scores from 0 to 1, (D,) classes."""
 
-    boxes: NDArray[np.float32]
-    scores: NDArray[np.float32]
+    boxes: Floats
+    scores: Floats
     classes: NDArray[np.int64]
 
 
 def view(
-    points: NDArray[np.float32],
-    reflectance: NDArray[np.float32],
+    points: Floats,
+    reflectance: Floats,
 ) -> Tensor:
     """(n, n, CHANNELS) uint8: a scan of N points from above, x along the first axis."""
     image = np.zeros((CELLS * CELLS, SLICES + 2), np.uint8)
@@ -92,7 +94,7 @@ def _fill(image, count, points, reflectance):  # type: ignore[no-untyped-def]
 
 
 def targets(
-    boxes: NDArray[np.float32],
+    boxes: Floats,
     classes: NDArray[np.int64],
     pixel: float,
 ) -> Target:
@@ -174,7 +176,7 @@ def decode(
 
 
 def _apart(
-    places: NDArray[np.float32],
+    places: Floats,
     distance: float,
 ) -> list[int]:
     """The places (D, 2) in order, without those within a distance of an earlier one."""
@@ -188,7 +190,7 @@ def _apart(
 def boxes_at(
     index: Tensor,
     values: Tensor,
-) -> NDArray[np.float32]:
+) -> Floats:
     """(D, 7) boxes that the pixels with these flat indices hold."""
     count = values.shape[-1]
     found = values.flatten(1)[:, index].double().numpy()
