@@ -81,10 +81,6 @@ def write_infos(
     """
     out = Path(out).resolve()
     given = _read(real)
-    if not isinstance(given, dict) or not given.get("data_list"):
-        raise DataError(
-            f"{real} has no 'data_list'", "an info list of MMDetection3D 1.1 or later"
-        )
     entries = given["data_list"]
     detects = "instances" in entries[0]
     if not detects:
@@ -101,35 +97,35 @@ def write_infos(
         "format": FORMAT,
         "real": len(entries),
         "settings": _stored(settings),
+        "layout": _layout(given, entries[0], layout, real),
+        "view": None if view is False else camera,
     }
-    facts["layout"] = _layout(given, entries[0], layout, real)
-    facts["view"] = None if view is False else camera
     folder = SlotFolder(out, facts)
-    for slot in range(min(folder.slots, LOOKED_AT) if detects else 0):
-        require_boxes(folder.scan(slot), folder.layout.classes)
-    slots = [
-        _slot(out, i, folder.layout.features, entries[i % len(entries)], detects)
-        for i in range(folder.slots)
-    ]
-    write_file(
-        out / MIXTURE,
-        json.dumps(facts | {"plan": folder.mixed.plan(0).hash}, indent=1).encode(),
-    )
-    listed = {"metainfo": given.get("metainfo", {}), "data_list": entries + slots}
+    facts["plan"] = folder.mixed.plan(0).hash
+    entries = entries + _slots(out, folder, entries, detects)
+    write_file(out / MIXTURE, json.dumps(facts, indent=1).encode())
+    listed = {"metainfo": given.get("metainfo", {}), "data_list": entries}
     write_file(out / INFOS, json.dumps(listed, default=_plain).encode())
     open_folder.cache_clear()  # this process may have opened an earlier list in this folder
     return out / INFOS
 
 
 def _read(real: str | Path) -> Any:
+    """The trainer's list, with at least one entry."""
     if Path(real).suffix == ".json":
-        return parse_json(
+        given = parse_json(
             read_text(Path(real)), str(real), "an info list of MMDetection3D"
         )
-    # reads the trainer's own pickle, as the trainer does
-    from mmengine.fileio import load
+    else:
+        # reads the trainer's own pickle, as the trainer does
+        from mmengine.fileio import load
 
-    return load(str(real))
+        given = load(str(real))
+    if not isinstance(given, dict) or not given.get("data_list"):
+        raise DataError(
+            f"{real} has no 'data_list'", "an info list of MMDetection3D 1.1 or later"
+        )
+    return given
 
 
 def _stored(settings: dict[str, Any]) -> dict[str, Any]:
@@ -184,6 +180,18 @@ def _layout(
             f"another layout: {fits}",
         )
     return name
+
+
+def _slots(
+    out: Path, folder: SlotFolder, entries: list[Entry], detects: bool
+) -> list[Entry]:
+    """The entries for synthetic scans; for detection, the first scans need boxes."""
+    for slot in range(min(folder.slots, LOOKED_AT) if detects else 0):
+        require_boxes(folder.scan(slot), folder.layout.classes)
+    return [
+        _slot(out, i, folder.layout.features, entries[i % len(entries)], detects)
+        for i in range(folder.slots)
+    ]
 
 
 def _slot(out: Path, number: int, features: int, real: Entry, detects: bool) -> Entry:
