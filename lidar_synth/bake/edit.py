@@ -24,7 +24,7 @@ from lidar_synth.bake.making import claim_bank
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader, ShardWriter
 from lidar_synth.bank.folder import LocalFolder, copy_shard
 from lidar_synth.errors import ConfigError
-from lidar_synth.files.disk import hash_of_names, unwritable
+from lidar_synth.files.disk import hash_of_names, writing
 
 
 def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
@@ -255,10 +255,8 @@ def _link_file(source: Path, path: Path) -> None:
     try:
         os.link(source.resolve(), path)  # the hub's cache holds relative symlinks
     except OSError:
-        try:
+        with writing(path):
             shutil.copyfile(source, path)
-        except OSError as error:
-            raise unwritable(path, error) from error
 
 
 @contextmanager

@@ -35,7 +35,7 @@ from lidar_synth.bank.folder import LocalFolder, check_copy, copy_files
 from lidar_synth.bank.index import Entry, Index
 from lidar_synth.bank.storage import LocalFile, RemoteFile, Storage
 from lidar_synth.errors import ConfigError, FileError, LidarSynthError
-from lidar_synth.files.disk import remove_file, unwritable
+from lidar_synth.files.disk import remove_file, writing
 from lidar_synth.files.lock import lock_alone, one_writer, try_lock
 
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
@@ -81,7 +81,7 @@ class ShardCache:
                 f"limit={limit!r} for a bank with a shard of {largest / 1e6:.3g} MB",
                 "room for several of its shards",
             )
-        with _writing(folder):
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with self._table.open("ab") as file:
                 file.truncate(8 * len(index.shards))
@@ -114,7 +114,7 @@ class ShardCache:
         """
         self.close()
         shards = np.searchsorted(self.index.ends, numbers, side="right")
-        with _writing(self.folder):
+        with writing(self.folder):
             self._plan = _Plan(self, shards)
         self._plan.start()
 
@@ -186,7 +186,7 @@ class ShardCache:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ |= state
-        with _writing(self.folder):
+        with writing(self.folder):
             self._times = self._open_table()
 
     def _open_table(self) -> NDArray[np.int64]:
@@ -217,7 +217,7 @@ class ShardCache:
     @contextmanager
     def _alone(self) -> Iterator[None]:
         with ExitStack() as held:
-            with _writing(self.folder):
+            with writing(self.folder):
                 held.enter_context(lock_alone(self.folder / "lock"))
             yield
 
@@ -248,7 +248,7 @@ class ShardCache:
             return None
         with ExitStack() as held:
             part = held.enter_context(LocalFolder(self.folder).making(name))
-            with _writing(part):
+            with writing(part):
                 held.enter_context(one_writer(part))
                 os.truncate(part, entry.bytes)
             return _Claim(entry, part, held.pop_all())
@@ -436,18 +436,3 @@ def _size(path: Path) -> int:
     with suppress(OSError):
         return path.stat().st_size
     return 0
-
-
-@contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    """Name the folder in errors of the system.
-
-    Raises:
-        FileError: if it cannot be written.
-    """
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, LidarSynthError):
-            raise
-        raise unwritable(folder, error) from error

@@ -24,15 +24,15 @@ from lidar_synth.bank.storage import (
     bank_root,
     open_system,
 )
-from lidar_synth.errors import DataError, FileError, LidarSynthError
+from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import (
     part_of,
     read_file,
+    reading,
     sha256,
     sync_folder,
-    unreadable,
-    unwritable,
     write_file,
+    writing,
 )
 
 BLOCK = 4 << 20
@@ -84,11 +84,9 @@ class LocalFolder:
         self.root = root
 
     def sizes(self) -> dict[str, int]:
-        try:
+        with reading(self.root, "the folder of a bank"):
             files = [path for path in self.root.glob("[!.]*") if path.is_file()]
             return {path.name: path.stat().st_size for path in files}
-        except OSError as error:
-            raise unreadable(self.root, error, "the folder of a bank") from error
 
     def read(self, name: str) -> bytes:
         return read_file(self.root / name, "a file of a bank")
@@ -98,10 +96,8 @@ class LocalFolder:
         sync_folder(self.root)
 
     def put(self, path: Path, name: str) -> None:
-        try:
+        with writing(self.root / name):
             path.replace(self.root / name)
-        except OSError as error:
-            raise unwritable(self.root / name, error) from error
         sync_folder(self.root)
 
     @contextmanager
@@ -175,13 +171,11 @@ class RemoteFolder:
 
     @contextmanager
     def making(self, name: str) -> Iterator[Path]:
-        try:
-            with tempfile.TemporaryDirectory(prefix="lidar_synth-") as folder:
-                yield part_of(Path(folder, Path(name).name))
-        except OSError as error:
-            if isinstance(error, LidarSynthError):
-                raise
-            raise unwritable(Path(tempfile.gettempdir()), error) from error
+        with (
+            writing(Path(tempfile.gettempdir())),
+            tempfile.TemporaryDirectory(prefix="lidar_synth-") as folder,
+        ):
+            yield part_of(Path(folder, Path(name).name))
 
     @contextmanager
     def local(self, name: str, size: int) -> Iterator[Path]:
@@ -266,17 +260,13 @@ def copy_files(
 
 def _write_blocks(path: Path, blocks: Iterable[bytes]) -> str:
     digest = hashlib.sha256()
-    try:
+    with writing(path):
         path.touch()
         with path.open("r+b") as out:  # its size stays what was reserved for it
             for block in blocks:
                 digest.update(block)
                 out.write(block)
             out.truncate()
-    except OSError as error:
-        if isinstance(error, LidarSynthError):
-            raise
-        raise unwritable(path, error) from error
     return digest.hexdigest()
 
 

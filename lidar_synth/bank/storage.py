@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from lidar_synth.bank.retries import PATIENCE, keep_trying
 from lidar_synth.errors import DataError, FileError, LibraryError
-from lidar_synth.files.disk import refuse_special, unreadable
+from lidar_synth.files.disk import reading, refuse_special
 
 SCHEMES = frozenset("http https s3 gs gcs az abfs abfss hf file memory".split())
 """Kinds of URLs that are opened; others of fsspec's lead to further files or run what they name."""
@@ -88,15 +88,13 @@ class LocalFile:
             raise DataError(
                 f"{self._path} ends before byte {offset + size}", "a complete file"
             )
-        try:
+        with reading(self._path, "a file of a bank"):
             if hasattr(os, "pread"):
                 content = os.pread(self._descriptor, size, offset)
             else:  # on Windows, where no other file can take the place of an open one
                 with self._path.open("rb") as file:
                     file.seek(offset)
                     content = file.read(size)
-        except OSError as error:
-            raise unreadable(self._path, error, "a file of a bank") from error
         if len(content) != size:
             raise DataError(
                 f"{self._path} was truncated while it was read", "a complete file"
@@ -112,12 +110,10 @@ class LocalFile:
 
     def _open(self) -> tuple[int, int, int]:
         """Size, time of change and number of the file, which is open then."""
-        try:
+        with reading(self._path, "a file of a bank"):
             refuse_special(self._path)
             self._descriptor = os.open(self._path, os.O_RDONLY)
             found = os.fstat(self._descriptor)
-        except OSError as error:
-            raise unreadable(self._path, error, "a file of a bank") from error
         return found.st_size, found.st_mtime_ns, found.st_ino
 
 

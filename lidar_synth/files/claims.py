@@ -9,7 +9,7 @@ from reprlib import Repr
 from typing import Any
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files.disk import read_text, unwritable, write_file
+from lidar_synth.files.disk import read_text, write_file, writing
 from lidar_synth.files.lock import one_writer
 from lidar_synth.files.parsing import parse_json
 
@@ -106,10 +106,8 @@ def hold_writing(path: Path) -> Iterator[None]:
         FileError: if the claim cannot be opened for writing.
     """
     with ExitStack() as held:
-        try:
+        with writing(path):
             alone = held.enter_context(one_writer(path))
-        except OSError as error:
-            raise unwritable(path, error) from error
         if not alone:
             raise ConfigError(
                 f"{path.parent}, in which another process works",

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError, FileError, shorten
+from lidar_synth.errors import DataError, FileError, LidarSynthError, shorten
 
 LARGEST_IMAGE = 65535
 """Maximum width and height of an image in pixels."""
@@ -66,21 +66,20 @@ def write_file(
     """
     part = part_of(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.unlink(missing_ok=True)
-        # always a new file, never the target of a link with this name
-        with part.open("xb") as file:
-            if callable(content):
-                content(file)
-            else:
-                file.write(content)
-            if durable:
-                file.flush()
-                os.fsync(file.fileno())
-        if overwrite or not _linked(part, path):
-            part.replace(path)
-    except OSError as error:
-        raise unwritable(path, error) from error
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.unlink(missing_ok=True)
+            # always a new file, never the target of a link with this name
+            with part.open("xb") as file:
+                if callable(content):
+                    content(file)
+                else:
+                    file.write(content)
+                if durable:
+                    file.flush()
+                    os.fsync(file.fileno())
+            if overwrite or not _linked(part, path):
+                part.replace(path)
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
@@ -122,12 +121,10 @@ def open_file(
     Raises:
         FileError: if it cannot be opened or read, or is special.
     """
-    try:
+    with reading(path, expected):
         refuse_special(path)
         with path.open("rb") as file:
             yield file
-    except OSError as error:
-        raise unreadable(path, error, expected) from error
 
 
 def read_file(
@@ -218,27 +215,43 @@ def remove_file(path: Path) -> None:
     Raises:
         FileError: if it cannot be removed.
     """
-    try:
+    with writing(path):
         path.unlink(missing_ok=True)
+
+
+@contextmanager
+def reading(path: Path, expected: str = "a file of the dataset") -> Iterator[None]:
+    """Name a path in errors of the system.
+
+    Raises:
+        FileError: if it cannot be read.
+    """
+    try:
+        yield
     except OSError as error:
-        raise unwritable(path, error) from error
+        raise FileError(
+            f"{path} cannot be read ({error.strerror or error})", expected
+        ) from error
 
 
-def unreadable(
-    path: Path, error: OSError, expected: str = "a file of the dataset"
-) -> FileError:
-    """The error for a path that cannot be read."""
-    return FileError(f"{path} cannot be read ({error.strerror or error})", expected)
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Name a path in errors of the system; those of the package pass.
 
-
-def unwritable(path: Path, error: OSError) -> FileError:
-    """The error for a path that cannot be written."""
-    return FileError(
-        f"{path} cannot be written ({error.strerror or error})",
-        "a writable folder on a disk with free space",
-        "Choose another output folder or free some space, then run the same again: complete "
-        "files are kept.",
-    )
+    Raises:
+        FileError: if it cannot be written.
+    """
+    try:
+        yield
+    except LidarSynthError:
+        raise
+    except OSError as error:
+        raise FileError(
+            f"{path} cannot be written ({error.strerror or error})",
+            "a writable folder on a disk with free space",
+            "Choose another output folder or free some space, then run the same again: complete "
+            "files are kept.",
+        ) from error
 
 
 def join_inside(folder: Path, name: str) -> Path:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import numbers, unreadable, write_file
+from lidar_synth.files.disk import numbers, reading, write_file
 from lidar_synth.geometry.scan import FARTHEST, Boxes
 
 MARGIN = 100
@@ -146,31 +146,32 @@ def read_boxes(path: Path) -> WorldBoxes:
     windows = []
     annotated = set()
     try:
-        for _, node in ElementTree.iterparse(path):
-            if node.find("transform") is None:
-                continue
-            semantic = int(
-                node.findtext("semanticId")
-                or BY_LABEL.get(node.findtext("label", ""), -1)
-            )
-            frame, first, last = (
-                int(node.findtext(t) or -1)
-                for t in ("timestamp", "start_frame", "end_frame")
-            )
-            span = (first - MARGIN, last + MARGIN)
-            annotated.add(span)
-            if semantic in OBJECTS:
-                _, image_id, name = OBJECTS[semantic]
-                transforms.append(
-                    _matrix(node, "transform", (4, 4))
-                    @ _unit_cube(_matrix(node, "vertices", (-1, 3)))
+        with reading(path):
+            for _, node in ElementTree.iterparse(path):
+                if node.find("transform") is None:
+                    continue
+                semantic = int(
+                    node.findtext("semanticId")
+                    or BY_LABEL.get(node.findtext("label", ""), -1)
                 )
-                names.append(name)
-                instances.append(
-                    image_id * MAX_INSTANCES + int(node.findtext("instanceId") or 0)
+                frame, first, last = (
+                    int(node.findtext(t) or -1)
+                    for t in ("timestamp", "start_frame", "end_frame")
                 )
-                windows.append((frame, frame) if frame >= 0 else span)
-            node.clear()
+                span = (first - MARGIN, last + MARGIN)
+                annotated.add(span)
+                if semantic in OBJECTS:
+                    _, image_id, name = OBJECTS[semantic]
+                    transforms.append(
+                        _matrix(node, "transform", (4, 4))
+                        @ _unit_cube(_matrix(node, "vertices", (-1, 3)))
+                    )
+                    names.append(name)
+                    instances.append(
+                        image_id * MAX_INSTANCES + int(node.findtext("instanceId") or 0)
+                    )
+                    windows.append((frame, frame) if frame >= 0 else span)
+                node.clear()
         found = WorldBoxes(
             np.array(transforms).reshape(-1, 4, 4),
             np.array(names, np.str_),
@@ -178,8 +179,6 @@ def read_boxes(path: Path) -> WorldBoxes:
             np.array(windows, np.int64).reshape(-1, 2),
             np.array(sorted(annotated), np.int64).reshape(-1, 2),
         )
-    except OSError as error:
-        raise unreadable(path, error) from error
     except (ElementTree.ParseError, ValueError, LookupError, OverflowError) as error:
         raise DataError(f"{path}: {error}", "KITTI-360's data_3d_bboxes") from error
     sizes = np.linalg.norm(found.transforms[:, :3, :3], axis=1)
@@ -251,12 +250,11 @@ def _read_others(path: Path, frames: Container[int]) -> ElementTree.Element:
     if not path.is_file():
         return ElementTree.Element("opencv_storage")
     try:
-        root = ElementTree.parse(path).getroot()
+        with reading(path):
+            root = ElementTree.parse(path).getroot()
         root[:] = [
             node for node in root if int(node.findtext("timestamp") or -1) not in frames
         ]
-    except OSError as error:
-        raise unreadable(path, error) from error
     # LookupError: an unknown encoding
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise DataError(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files.disk import SKIP_HINT, refuse_special, unreadable, write_file
+from lidar_synth.files.disk import SKIP_HINT, reading, refuse_special, write_file
 from lidar_synth.formats.calibration import check_rigid
 from lidar_synth.geometry.scan import FARTHEST, Scan
 
@@ -48,12 +48,10 @@ def read_points(
         FileError: if the file cannot be read.
         DataError: on an empty or truncated file, and on values that cannot be points.
     """
-    try:
+    with reading(path):
         refuse_special(path)
         values = np.fromfile(path, "<f4")
         size = path.stat().st_size
-    except OSError as error:
-        raise unreadable(path, error) from error
     if size == 0:
         raise DataError(
             f"{path} is empty", f"{4 * fields} bytes for each point", SKIP_HINT

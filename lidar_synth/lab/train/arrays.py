@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.disk import unreadable, unwritable, write_file
+from lidar_synth.files.disk import reading, write_file, writing
 from lidar_synth.files.parsing import read_sealed, seal
 from lidar_synth.files.processes import map_in_processes
 from lidar_synth.lab.train.ranks import ALONE, Ranks
@@ -220,12 +220,9 @@ def _write(folder: Path, place: int, made: Arrays) -> None:
     """
     for name, values in made.items():
         path = folder / f"{name}.npy"
-        try:
-            with path.open("r+b") as file:
-                file.seek(place * values.nbytes, os.SEEK_END)
-                file.write(values.data)
-        except OSError as error:
-            raise unwritable(path, error) from error
+        with writing(path), path.open("r+b") as file:
+            file.seek(place * values.nbytes, os.SEEK_END)
+            file.write(values.data)
 
 
 def _open_arrays(folder: Path, layout: Layout) -> dict[str, NDArray[Any]]:
@@ -252,7 +249,7 @@ def _open_array(
         },
     )
     start = header.getvalue()
-    try:
+    with reading(path, "a file of a cache"):
         size = path.stat().st_size
         with path.open("rb") as file:
             same = file.read(len(start)) == start
@@ -261,8 +258,6 @@ def _open_array(
                 f"{path} is truncated or damaged", f"{np.dtype(dtype)} of shape {shape}"
             )
         return np.memmap(path, dtype, "r", len(start), shape)
-    except OSError as error:
-        raise unreadable(path, error, "a file of a cache") from error
 
 
 def _sum(made: Arrays) -> int:

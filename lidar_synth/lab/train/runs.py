@@ -27,7 +27,7 @@ import yaml
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.files.disk import unwritable, write_file
+from lidar_synth.files.disk import write_file, writing
 from lidar_synth.files.lock import one_writer
 from lidar_synth.generate.checkpoint import save_checkpoint
 from lidar_synth.lab.train.autoencoder import AutoencoderStage
@@ -230,11 +230,9 @@ def _lock(config: Run, accelerator: "Accelerator") -> Iterator[None]:
         yield
         return
     with ExitStack() as held:
-        try:
+        with writing(config.output):
             config.output.mkdir(parents=True, exist_ok=True)
             free = held.enter_context(one_writer(config.output / ".lock"))
-        except OSError as error:
-            raise unwritable(config.output, error) from error
         if not free:
             raise ConfigError(
                 f"another run is training in {config.output}",
