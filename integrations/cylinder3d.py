@@ -28,7 +28,7 @@ from lidar_synth.integrations.mixture import (
 )
 
 from lidar_synth.errors import LibraryError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 NAME = "SemKITTI_mixed"
 USAGE = (

@@ -26,7 +26,7 @@ from lidar_synth.files.disk import write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA
 from lidar_synth.formats.nuscenes import INTENSITY_MAX
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.labels import ObjectBank
 
 NEAR = 40.0

@@ -22,7 +22,7 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA, KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.formats.writer import Writer
-from lidar_synth.geometry.scan import Scan, Source, scan_hash
+from lidar_synth.geometry import Scan, Source, scan_hash
 from lidar_synth.mixing import MixedScans
 
 COMPARED = 3

@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.generate.generator import Generated
-from lidar_synth.geometry.scan import Source
+from lidar_synth.geometry import Source
 from lidar_synth.mixing import Collate, MixedBatches, MixedScans
 from lidar_synth.mixing.batches import CutSteps, cut_steps
 from lidar_synth.mixing.items import copy_scan

@@ -23,7 +23,7 @@ from lidar_synth.datasets.classes import (
     Taxonomy,
 )
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.labels.own import IgnoreLabels, RemoveLabels
 from lidar_synth.labels.policies import read_policy
 from lidar_synth.mixing import MixedScans, MixingPlan

@@ -37,7 +37,7 @@ from lidar_synth.integrations.weights import KEY, weigh_mmdet3d
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 try:
     import mmdet3d

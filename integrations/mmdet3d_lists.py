@@ -23,7 +23,7 @@ from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats import KITTIObject, SemanticKITTI
 from lidar_synth.formats.calibration import Calibration, in_view
 from lidar_synth.formats.kitti_labels import boxes_to_camera
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry import Boxes, Scan
 
 CLASSES = (
     "Pedestrian",

@@ -31,7 +31,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_text
 from lidar_synth.formats.calibration import Calibration, in_view
 from lidar_synth.formats.point_labels import encode_labels
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.mixing.schedules import settled
 
 PREFIX = "lsynth://"

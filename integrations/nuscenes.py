@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.formats.nuscenes import INTENSITY_MAX
+from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.geometry.projection import locate
-from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import move_boxes
 
 CLASSES = (

@@ -32,7 +32,7 @@ from lidar_synth.integrations.mixture import (
 )
 
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 _IDS = id_table(1, 0, np.int32)
 

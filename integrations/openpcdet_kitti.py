@@ -16,7 +16,7 @@ from pcdet.datasets.kitti.kitti_dataset import KittiDataset
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.calibration import Calibration, homogeneous, in_view
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 
 class MixedKitti(MixedDetection, KittiDataset):  # type: ignore[misc]

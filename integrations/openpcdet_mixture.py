@@ -16,7 +16,7 @@ from lidar_synth.integrations.mixture import (
 from lidar_synth.integrations.weights import KEY
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 
 class MixedDetection(MixedEpoch):

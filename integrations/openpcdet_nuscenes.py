@@ -10,7 +10,7 @@ from lidar_synth.integrations.openpcdet_mixture import MixedDetection
 from pcdet.datasets.nuscenes.nuscenes_dataset import NuScenesDataset
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 SRC = ["x", "y", "z", "intensity", "timestamp"]
 """The features that a sample has, in OpenPCDet's order."""

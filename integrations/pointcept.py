@@ -33,7 +33,7 @@ from lidar_synth.integrations.mixture import (
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 try:
     from pointcept.datasets.builder import DATASETS

@@ -36,7 +36,7 @@ from torch.utils.data import DataLoader
 from lidar_synth.datasets.classes import Taxonomy
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.formats.point_labels import encode_labels
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 USAGE = (
     "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.rangenet train.py ARGUMENTS, in "

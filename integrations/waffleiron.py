@@ -31,7 +31,7 @@ from lidar_synth.integrations.mixture import (
 from lidar_synth.integrations.removed import provide
 
 from lidar_synth.errors import LibraryError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 NAME = "semantic_kitti_mixed"
 USAGE = (

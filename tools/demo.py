@@ -32,7 +32,7 @@ from typer import Argument, run
 from lidar_synth import Bank, Scan, Source, load_sensor, mix, open_scans, sample_scans
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.files.disk import write_file
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, spread
+from lidar_synth.geometry import REAL, SYNTHETIC, spread
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels import edit
 from lidar_synth.viz import html_page

@@ -30,7 +30,7 @@ from typer import Option, run
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import LidarSynthError
 from lidar_synth.generate.loading import load_generator
-from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry import RangeImage
 from lidar_synth.mixing.service import RollingBank
 
 SCANS = 40

@@ -16,8 +16,8 @@ from lidar_synth.bake.making import claim_bank
 from lidar_synth.bake.verify import check_scans
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.bank.folder import LocalFolder
+from lidar_synth.geometry import RangeImage
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.noise import keyed_rng
 

@@ -15,10 +15,9 @@ from lidar_synth.errors import ConfigError, DataError, LibraryError, choose
 from lidar_synth.files.disk import hash_of_names, read_file
 from lidar_synth.formats import ScanFiles, open_scans
 from lidar_synth.generate.generator import Generator
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.layout import Layout
 from lidar_synth.geometry.layout.files import load_layout
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.bank import ObjectBank
 
 FOCAL_TOLERANCE = 0.02

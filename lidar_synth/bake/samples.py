@@ -15,7 +15,7 @@ from lidar_synth.bake.conditions import (
 from lidar_synth.datasets.recordings import NOTE, seen_by
 from lidar_synth.formats.writer import Writer
 from lidar_synth.generate.generator import Generator, SamplingOptions
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 
 @dataclass(frozen=True)

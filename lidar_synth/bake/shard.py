@@ -26,7 +26,7 @@ from lidar_synth.errors import ConfigError, FileError, LidarSynthError
 from lidar_synth.files.processes import usable_cores
 from lidar_synth.generate.generator import BATCH, Generator
 from lidar_synth.generate.loading import load_generator
-from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry import RangeImage
 
 _PACKED = (
     0.6  # highest ratio of compressed to plain size, for scans that models generate

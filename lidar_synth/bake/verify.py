@@ -19,7 +19,7 @@ from lidar_synth.bank.reader import read_index
 from lidar_synth.bank.storage import bank_root
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import sha256
-from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry import RangeImage
 
 AGREE = 0.9
 """Lowest share of cells in which a regenerated scan must agree. On the machine that made the bank

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Boxes
+from lidar_synth.geometry import Boxes
 
 NAMES = (
     "Car",

@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from lidar_synth.bank.boxes import SHAPE, check_boxes, decode_boxes, encode_boxes
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import RangeImage
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import RangeImage, Sensor
 
 _compiled = numba.njit(nogil=True, cache=True)
 

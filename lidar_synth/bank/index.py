@@ -51,7 +51,7 @@ from lidar_synth.bank.encoding import RANGE_STEPS, Encoding
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import json_checksum
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 
 FORMAT = "lidar-synth-bank/1"
 BOXED_FORMAT = "lidar-synth-bank/2"

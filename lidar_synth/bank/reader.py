@@ -15,15 +15,15 @@ from lidar_synth.bank.shard import ShardReader
 from lidar_synth.bank.storage import RemoteFile, bank_root, open_storage
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import read_start
-from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import (
+from lidar_synth.geometry import (
     REAL,
     SYNTHETIC,
     RangeImage,
     Scan,
+    Sensor,
     model_provenance,
 )
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.projection import unproject
 
 _OPEN = 64  # files kept open at a time
 _KNOWN = 1 << 20  # scans whose places are kept in memory, about 60 bytes each

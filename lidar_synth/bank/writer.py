@@ -16,7 +16,7 @@ from lidar_synth.bank.chunks import checksum, deflate, filters
 from lidar_synth.bank.index import Entry, Facts
 from lidar_synth.bank.layout import metadata_size
 from lidar_synth.errors import DataError, FileError, LibraryError
-from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry import RangeImage
 
 _VERSION = "v110"
 # Bytes: a paged file keeps its metadata together, for fewer requests over a network.

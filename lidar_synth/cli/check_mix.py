@@ -9,7 +9,7 @@ from typer import Argument, Option, echo
 from lidar_synth.cli.options import Reading, drop_missing, options_from
 
 if TYPE_CHECKING:
-    from lidar_synth.geometry.scan import Scan
+    from lidar_synth.geometry import Scan
     from lidar_synth.mixing.meaning import Meaning
 
 
@@ -51,7 +51,7 @@ def check_mix(
     """
     from lidar_synth.errors import ConfigError
     from lidar_synth.formats import open_scans
-    from lidar_synth.geometry.scan import spread
+    from lidar_synth.geometry import spread
     from lidar_synth.mixing.compare import USUAL_IGNORE, report
     from lidar_synth.mixing.meaning import (
         contradictions,

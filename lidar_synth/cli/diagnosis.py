@@ -225,9 +225,8 @@ def _geometry() -> Finding:
     try:
         import numpy as np
 
+        from lidar_synth.geometry import RangeImage, load_sensor
         from lidar_synth.geometry.projection import project, unproject
-        from lidar_synth.geometry.scan import RangeImage
-        from lidar_synth.geometry.sensor import load_sensor
 
         sensor = load_sensor("hdl64e_kitti360")
         image = RangeImage(np.full(sensor.shape, 10, np.float32), sensor)

@@ -17,7 +17,7 @@ from lidar_synth.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from lidar_synth.geometry.scan import Scan
+    from lidar_synth.geometry import Scan
 
 edit = Typer(
     name="edit",

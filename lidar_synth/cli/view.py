@@ -12,7 +12,7 @@ from lidar_synth.errors import ConfigError
 
 if TYPE_CHECKING:
     from lidar_synth.formats import ScanFiles
-    from lidar_synth.geometry.scan import Scan
+    from lidar_synth.geometry import Scan
 
 
 @options_from(Reading, after="sensor")

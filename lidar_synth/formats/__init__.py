@@ -36,7 +36,7 @@ from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWrite
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.webdataset import WebDataset, WebDatasetWriter
 from lidar_synth.formats.writer import Writer
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 
 __all__ = [
     "KITTI360",

@@ -9,8 +9,7 @@ from typing import Any
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.source import ScanFiles
-from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry import Scan, Sensor, Source, load_sensor
 from lidar_synth.geometry.transfer import (
     Measurement,
     Mount,

@@ -5,8 +5,7 @@ from pathlib import Path
 from lidar_synth.bank import Bank, is_bank
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry import Scan, Sensor, load_sensor
 
 
 class BankScans(ScanFiles):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import LARGEST_IMAGE
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 Matrix = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from lidar_synth.errors import DataError
 from lidar_synth.formats.calibration import Calibration, in_view, read_image_size
 from lidar_synth.formats.source import ScanFiles
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 IMAGE_SIZE = (1242, 375)
 """(width, height) of KITTI's images in pixels, taken where no file tells it."""

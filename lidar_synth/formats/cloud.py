@@ -26,7 +26,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import SKIP_HINT, read_start
 from lidar_synth.formats.description import Description, from_comments
 from lidar_synth.formats.npz import TYPES
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 STORED = {
     "label": "<u1",

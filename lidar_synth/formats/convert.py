@@ -21,9 +21,8 @@ from lidar_synth.formats import OnBad, ScanFiles, Writer
 from lidar_synth.formats.as_sensor import AsSensor
 from lidar_synth.formats.description import NAME, Origin, add_origin
 from lidar_synth.formats.models import models_of, write_models
+from lidar_synth.geometry import Scan, Sensor, Source
 from lidar_synth.geometry.projection import unfold, unproject
-from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer import Transfer
 
 CHUNK = 8

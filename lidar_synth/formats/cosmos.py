@@ -36,9 +36,8 @@ from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import FileWriter, project_scan
+from lidar_synth.geometry import RangeImage, Scan, Sensor
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.geometry.sensor import Sensor
 
 SUFFIX = ".safetensors"
 TENSOR = "frames"

@@ -29,8 +29,7 @@ from typing import Any
 from lidar_synth.errors import ConfigError, DataError, shorten, suggest
 from lidar_synth.files.disk import read_start, read_text, write_file
 from lidar_synth.files.parsing import parse_json
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
-from lidar_synth.geometry.sensor import Sensor, presets
+from lidar_synth.geometry import REAL, SYNTHETIC, Scan, Sensor, presets
 
 NAME = "scans.json"
 """File in the root of a folder that describes its scans."""

@@ -45,10 +45,9 @@ from lidar_synth.formats.point_labels import encode_labels, read_labels, write_l
 from lidar_synth.formats.points import check_scale, check_scan, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import DETAILS, LABELS, FileWriter
+from lidar_synth.geometry import POINT_FIELDS, Boxes, Scan, Sensor
 from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.projection.unfold import rows_by_elevation
-from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor
 
 LOG_REFLECTANCE = 255.0
 """Maximum of the reflectance in the logs of Velodyne's, Hesai's and Ouster's drivers."""

@@ -75,8 +75,7 @@ from lidar_synth.formats.writer import (
     write_image,
     write_note,
 )
-from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Boxes, Scan, Sensor
 
 SPLITS = KITTI360_SPLITS
 """Drives of each split, named after the work that introduced it; None = all existing drives. The

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import numbers, reading, write_file
-from lidar_synth.geometry.scan import FARTHEST, Boxes
+from lidar_synth.geometry import FARTHEST, Boxes
 
 MARGIN = 100
 """Maximum distance in frames (about 80 m) from an object's window at which the object is listed."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.geometry.scan import FARTHEST, Boxes, wrap_angle
+from lidar_synth.geometry import FARTHEST, Boxes, wrap_angle
 
 Floats = NDArray[np.float64]
 

@@ -35,8 +35,7 @@ from lidar_synth.formats.kitti_labels import in_image, read_label_2, write_label
 from lidar_synth.formats.points import check_scale, read_points
 from lidar_synth.formats.source import OnBad
 from lidar_synth.formats.writer import Picture, Writer, write_image
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Scan, Sensor
 
 Part = Literal["training", "testing"]
 

@@ -30,8 +30,7 @@ from lidar_synth.formats.calibration import Calibration, homogeneous, read_image
 from lidar_synth.formats.camera_boxes import CameraBoxes
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad
-from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan, wrap_angle
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import FARTHEST, Boxes, Scan, Sensor, wrap_angle
 
 DRIVES = "*_drive_*/velodyne_points/data"
 """Pattern of the folders with scans, relative to the folder of a date."""

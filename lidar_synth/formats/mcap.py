@@ -24,8 +24,7 @@ from lidar_synth.formats.description import Description, from_comments, to_comme
 from lidar_synth.formats.folder import CloudFiles, PCDWriter, find_scans, has_files
 from lidar_synth.formats.points import check_scale
 from lidar_synth.formats.source import OnBad
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Scan, Sensor
 
 SUFFIX = ".mcap"
 TOPIC = "/points"

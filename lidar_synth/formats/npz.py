@@ -27,15 +27,15 @@ from lidar_synth.errors import DataError, LidarSynthError, shorten
 from lidar_synth.files.disk import SKIP_HINT, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.formats.description import check_provenance
-from lidar_synth.geometry.scan import (
+from lidar_synth.geometry import (
     POINT_FIELDS,
     REAL,
     SYNTHETIC,
     Boxes,
     RangeImage,
     Scan,
+    Sensor,
 )
-from lidar_synth.geometry.sensor import Sensor
 
 FACTS = ("sensor", "id", "domain", "provenance", "pose")
 """Names in a file that are not channels of a range image, like those that begin with ``BOX``."""

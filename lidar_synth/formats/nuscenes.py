@@ -33,8 +33,7 @@ from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.point_labels import mismatch
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Scan, Sensor
 
 SUFFIX = ".pcd.bin"
 INTENSITY_MAX = 255.0

@@ -45,9 +45,8 @@ from lidar_synth.formats.pandaset_tracks import (
 from lidar_synth.formats.point_labels import mismatch
 from lidar_synth.formats.points import check_points
 from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.geometry import Boxes, Scan, Sensor
 from lidar_synth.geometry.motion import from_world, interpolate_poses
-from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor
 
 FRAMES = "lidar/*.pkl.gz"
 SUFFIX = ".pkl.gz"

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.formats.pandas_table import read_table, require_numbers
+from lidar_synth.geometry import Boxes
 from lidar_synth.geometry.motion import from_world
-from lidar_synth.geometry.scan import Boxes
 
 BOXES = {
     "Car": "Car",

@@ -27,7 +27,7 @@ from lidar_synth.formats.cloud import (
     to_records,
 )
 from lidar_synth.formats.description import to_comments
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 MOST_EXPANSION = 89
 """Maximum factor of decompression: LZF expands 3 bytes to at most 264."""

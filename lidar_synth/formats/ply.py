@@ -28,7 +28,7 @@ from lidar_synth.formats.cloud import (
     to_records,
 )
 from lidar_synth.formats.description import to_comments
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 TYPES = {
     "char": "i1",

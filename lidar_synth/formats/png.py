@@ -30,9 +30,8 @@ from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import GridWriter, project_scan
+from lidar_synth.geometry import REAL, SYNTHETIC, RangeImage, Scan, Sensor, load_sensor
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 STEPS = 65535
 """The largest 16-bit value: ``range_max`` in range, 1 in reflectance."""

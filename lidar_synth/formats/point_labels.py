@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import IGNORE, Taxonomy
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import read_values, write_file
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 
 def read_labels(

@@ -15,7 +15,7 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import SKIP_HINT, reading, refuse_special, write_file
 from lidar_synth.formats.calibration import check_rigid
-from lidar_synth.geometry.scan import FARTHEST, Scan
+from lidar_synth.geometry import FARTHEST, Scan
 
 LONGEST = 60.0
 """Maximum time of a point from the moment of its scan's pose, seconds."""

@@ -29,9 +29,8 @@ from lidar_synth.formats.folder import rows_of_rings
 from lidar_synth.formats.nuscenes import RINGS, drop_nearest
 from lidar_synth.formats.points import check_points
 from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.geometry import Boxes, Scan, Sensor
 from lidar_synth.geometry.motion import from_world
-from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor
 
 SYNC = "sync.arrow"
 EGO = "ego_state_se3"

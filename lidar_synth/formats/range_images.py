@@ -33,9 +33,8 @@ from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import DETAILS, GridWriter, project_scan
+from lidar_synth.geometry import RangeImage, Scan, Sensor, load_sensor
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 SUFFIXES = (".npz", ".npy")
 

@@ -51,8 +51,7 @@ from lidar_synth.formats.writer import (
     write_image,
     write_note,
 )
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Scan, Sensor
 
 SPLITS: dict[str, tuple[str, ...] | None] = {
     "train": tuple(f"{i:02d}" for i in (0, 1, 2, 3, 4, 5, 6, 7, 9, 10)),

@@ -12,9 +12,8 @@ from lidar_synth.errors import ConfigError, DataError, FileError, suggest
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import FORMAT, NAME, read_description
 from lidar_synth.formats.points import bad_points_kept, drop_bad_points
+from lidar_synth.geometry import Scan, Sensor, load_sensor
 from lidar_synth.geometry.agreement import MOST_OUTSIDE, agreement
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 OnBad = Literal["error", "skip", "drop-points"]
 """The handling of bad scans: raise an error on a scan that cannot be read, skip it with a warning,

@@ -47,8 +47,7 @@ from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import DETAILS, NOTES, FileWriter, clear_notes
-from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Boxes, Scan, Sensor
 
 SUFFIX = ".tar"
 

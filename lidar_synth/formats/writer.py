@@ -42,8 +42,8 @@ from lidar_synth.formats.description import (
 from lidar_synth.formats.npz import check_pose, to_stored
 from lidar_synth.formats.points import check_scan, write_points
 from lidar_synth.formats.source import ScanFiles
+from lidar_synth.geometry import POINT_FIELDS, REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, RangeImage, Scan
 
 Image = NDArray[np.uint8]
 Picture = Image | Path

@@ -8,9 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from lidar_synth.datasets.classes import GROUND
+from lidar_synth.geometry import Boxes, RangeImage, Scan
 from lidar_synth.geometry.layout import Layout, select_known_boxes
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
 
 TOLERANCE = 0.1
 """Metres outside a box within which a point belongs to it."""

@@ -45,8 +45,8 @@ from lidar_synth.generate.conditions import CONDITIONS, Conditioned
 from lidar_synth.generate.devices import check_device
 from lidar_synth.generate.flow.solvers import read_grid, uniform_grid
 from lidar_synth.generate.models import assemble
+from lidar_synth.geometry import Sensor
 from lidar_synth.geometry.normalize import LABEL_BITS, Normalisation, TensorFormat
-from lidar_synth.geometry.sensor import Sensor
 
 FORMAT = "lidar-synth-checkpoint/2"
 CONVENTION = "t=1 noise, t=0 data, v=noise-data"

@@ -30,11 +30,10 @@ from torch import Tensor, nn
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.parsing import read_picture
+from lidar_synth.geometry import LABELLED_ONLY, Scan, Sensor
 from lidar_synth.geometry.layout import CHANNELS, CODES, Layout, layout_image, layout_of
 from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import LABELLED_ONLY, Scan
-from lidar_synth.geometry.sensor import Sensor
 
 if TYPE_CHECKING:
     from PIL.Image import Image as PILImage

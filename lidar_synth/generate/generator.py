@@ -28,16 +28,16 @@ from lidar_synth.generate.devices import refuse_worker, without_autocast
 from lidar_synth.generate.flow.guidance import guide
 from lidar_synth.generate.flow.path import Velocity
 from lidar_synth.generate.flow.solvers import mean_velocity, read_grid, solve
-from lidar_synth.geometry.normalize import TensorFormat
-from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import (
+from lidar_synth.geometry import (
     SYNTHETIC,
     RangeImage,
     Scan,
+    Sensor,
     identity_of,
     model_provenance,
 )
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.normalize import TensorFormat
+from lidar_synth.geometry.projection import unproject
 from lidar_synth.noise import gaussian, uniform
 
 BATCH = {"cpu": 1, "cuda": 16}

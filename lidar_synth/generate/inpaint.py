@@ -21,8 +21,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.devices import without_autocast
 from lidar_synth.generate.flow.solvers import mean_velocity, solve
 from lidar_synth.generate.generator import Generator
-from lidar_synth.geometry.scan import RangeImage
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import RangeImage, Sensor
 
 START = 0.6
 """Latest time of the noise from which a hole is sampled: the provisional content keeps its large

@@ -1,1 +1,48 @@
 """Scans, sensors, range images and the projections between them; no neural networks."""
+
+from lidar_synth.geometry.scan import (
+    CAUSES,
+    FARTHEST,
+    LABELLED_ONLY,
+    POINT_FIELDS,
+    REAL,
+    SYNTHETIC,
+    Boxes,
+    RangeImage,
+    Scan,
+    Source,
+    check_source,
+    identity_of,
+    model_provenance,
+    require_finite,
+    require_reflectance,
+    scan_hash,
+    spread,
+    wrap_angle,
+)
+from lidar_synth.geometry.sensor import Sensor, load_sensor, presets, sensor_yaml
+
+__all__ = [
+    "CAUSES",
+    "FARTHEST",
+    "LABELLED_ONLY",
+    "POINT_FIELDS",
+    "REAL",
+    "SYNTHETIC",
+    "Boxes",
+    "RangeImage",
+    "Scan",
+    "Sensor",
+    "Source",
+    "check_source",
+    "identity_of",
+    "load_sensor",
+    "model_provenance",
+    "presets",
+    "require_finite",
+    "require_reflectance",
+    "scan_hash",
+    "sensor_yaml",
+    "spread",
+    "wrap_angle",
+]

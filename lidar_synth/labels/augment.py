@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.geometry.projection import locate
-from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import move_boxes, turn_boxes, turn_points
 from lidar_synth.labels.own import check_share
 

@@ -32,8 +32,7 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
-from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan, Source, check_source
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import FARTHEST, Boxes, Scan, Sensor, Source, check_source
 from lidar_synth.labels.boxes import join_boxes
 from lidar_synth.labels.objects import Object, objects_of
 

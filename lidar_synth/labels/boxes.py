@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.scan import Boxes, wrap_angle
+from lidar_synth.geometry import Boxes, wrap_angle
 
 
 def box_frame(

@@ -21,8 +21,7 @@ import numpy as np
 from typing_extensions import Self
 
 from lidar_synth.errors import ConfigError, choose
-from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.geometry import Scan, Source, load_sensor
 from lidar_synth.labels import augment
 from lidar_synth.labels.augment import Augmentation
 from lidar_synth.labels.own import check_share

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.merge import merge_scans
 from lidar_synth.labels.objects import THINGS, Object

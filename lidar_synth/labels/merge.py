@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.geometry import SYNTHETIC, Boxes, Scan, Sensor
 from lidar_synth.geometry.assign import assign_beams
-from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import join_boxes
 from lidar_synth.labels.objects import find_returns, number_instances
 

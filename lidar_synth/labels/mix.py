@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import BOXED
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan, Source, check_source
+from lidar_synth.geometry import Scan, Source, check_source
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.edit.redraw import open_model
 from lidar_synth.labels.edit.unboxed import remove_unboxed

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE, LABELS, TRAIN_ID
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Boxes, Scan, Sensor
 from lidar_synth.labels.boxes import grow_box, turn_boxes, turn_points
 from lidar_synth.labels.ground import ground_under
 

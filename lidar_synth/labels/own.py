@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, shorten
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry import Scan, Source
 
 
 @dataclass(frozen=True)

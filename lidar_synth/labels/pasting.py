@@ -13,9 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry import Boxes, Scan, Sensor
 from lidar_synth.geometry.overlap import find_overlapping
-from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import forget_images, widen_boxes
 from lidar_synth.labels.ground import CLEARANCE, ground_under, standing
 from lidar_synth.labels.merge import merge_scans

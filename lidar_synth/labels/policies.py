@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidar_synth.errors import ConfigError, shorten, suggest
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry import Scan, Source
 
 LabelPolicy = Callable[[Scan, np.random.Generator], Scan]
 """Sets the labels of a synthetic scan; it returns a new scan and never changes its input."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.labels.own import check_share, trust_labels
 
 Teacher = Callable[[Scan], Any]

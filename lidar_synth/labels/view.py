@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.projection import locate
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.ground import FLOOR
 from lidar_synth.labels.objects import Object
 

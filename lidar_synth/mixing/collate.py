@@ -14,9 +14,8 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, choose
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing.items import Item
 
 Form = Literal["offsets", "padded", "range"]

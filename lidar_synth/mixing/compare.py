@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError
+from lidar_synth.geometry import SYNTHETIC, RangeImage, Scan, Sensor, spread
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, spread
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing.meaning import (
     Contradiction,
     Table,

@@ -8,7 +8,7 @@ import torch
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 
 class Item(dict[str, Any]):

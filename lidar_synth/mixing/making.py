@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import (
+from lidar_synth.geometry import (
     POINT_FIELDS,
     REAL,
     SYNTHETIC,
     Scan,
+    Sensor,
+    load_sensor,
     require_finite,
 )
-from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.labels.own import KeepBoxes, RemoveLabels
 from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy, read_policy
 from lidar_synth.mixing.items import copy_scan

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
+from lidar_synth.geometry import Scan
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Scan
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from torch.utils.data import get_worker_info
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.mixing.epochs import shared_integers
 from lidar_synth.mixing.meaning import OTHER_SIZE
 from lidar_synth.mixing.plan import MixingPlan

@@ -11,8 +11,14 @@ import numpy as np
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, check_source, identity_of
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import (
+    REAL,
+    SYNTHETIC,
+    Scan,
+    Sensor,
+    check_source,
+    identity_of,
+)
 from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled

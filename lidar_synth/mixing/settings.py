@@ -16,8 +16,7 @@ from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.as_sensor import make_transfer, read_transfer
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.defaults import detection_options, segmentation_options

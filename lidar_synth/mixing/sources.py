@@ -9,8 +9,7 @@ from torch.utils.data import ConcatDataset
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan, check_source
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Scan, Sensor, check_source
 from lidar_synth.labels.own import check_share
 
 

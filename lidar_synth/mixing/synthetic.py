@@ -3,8 +3,7 @@
 from dataclasses import replace
 from typing import Any, Protocol, cast, runtime_checkable
 
-from lidar_synth.geometry.scan import SYNTHETIC, Scan, Source, identity_of
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import SYNTHETIC, Scan, Sensor, Source, identity_of
 from lidar_synth.mixing.sources import first_of
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.disk import write_file
-from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry import RangeImage, Scan
 from lidar_synth.viz.images import picture
 from lidar_synth.viz.page import html_page
 from lidar_synth.viz.render import Camera, Orbit, bird, render

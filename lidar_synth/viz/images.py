@@ -8,13 +8,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, choose
+from lidar_synth.geometry import RangeImage, Scan, require_finite, require_reflectance
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import (
-    RangeImage,
-    Scan,
-    require_finite,
-    require_reflectance,
-)
 from lidar_synth.viz.scales import EMPTY, Rgb, Scale, make_scales
 
 CHANNELS = ("range", "reflectance", "label")

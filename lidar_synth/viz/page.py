@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.files.parsing import read_picture
-from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry import RangeImage, Scan
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Orbit, box_segments, render, ring_segments
 from lidar_synth.viz.scales import DOMAINS, EMPTY, Rgb, Scale, available, make_scales

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.viz.scales import EMPTY, Rgb, Scale, make_scales, point_values
 
 Floats = NDArray[np.float32]

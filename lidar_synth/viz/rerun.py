@@ -8,7 +8,7 @@ import numpy as np
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.errors import LibraryError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.viz.scales import make_scales, point_values
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.errors import ConfigError, choose
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 Rgb = NDArray[np.uint8]
 """(..., 3) uint8 red, green, blue."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import NAMES
-from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry import RangeImage, Scan
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Camera, bird, render
 from lidar_synth.viz.scales import DOMAINS, EMPTY, Rgb, Scale, make_scales

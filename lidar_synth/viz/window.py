@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidar_synth.errors import LibraryError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.viz.render import Orbit, box_segments
 from lidar_synth.viz.scales import EMPTY, Scale, make_scales, point_values
 

@@ -17,14 +17,14 @@ from typing_extensions import Self
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, choose
-from lidar_synth.geometry.assign import assign_beams
-from lidar_synth.geometry.scan import (
+from lidar_synth.geometry import (
     CAUSES,
     Boxes,
     Scan,
     require_finite,
     require_reflectance,
 )
+from lidar_synth.geometry.assign import assign_beams
 
 Values = NDArray[np.float32]
 

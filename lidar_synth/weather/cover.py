@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.weather.corruption import Change, Values, require_between
 from lidar_synth.weather.signal import SignalLoss, overlap, ranges_of
 

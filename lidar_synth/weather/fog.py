@@ -18,7 +18,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.weather.corruption import Change, require_between
 from lidar_synth.weather.signal import OVERLAP, SignalLoss, overlap, ranges_of
 

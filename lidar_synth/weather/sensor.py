@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.weather.corruption import (
     CROSSTALK,
     Change,

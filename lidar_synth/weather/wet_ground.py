@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, has_ground
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.weather.corruption import Change, require_between
 from lidar_synth.weather.signal import SignalLoss, ranges_of
 

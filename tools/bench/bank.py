@@ -37,9 +37,8 @@ from lidar_synth.bank import Bank, Encoding, Entry, Facts, Index, ShardWriter
 from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
 from lidar_synth.files.disk import sha256
 from lidar_synth.generate.loading import load_generator
+from lidar_synth.geometry import RangeImage, Sensor, load_sensor
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import RangeImage
-from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town import Town
 
 SHARD = 64

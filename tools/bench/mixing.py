@@ -22,8 +22,8 @@ from typer import run
 
 from lidar_synth.bank import Bank
 from lidar_synth.formats import WRITERS, SemanticKITTI
+from lidar_synth.geometry import Scan, Source
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.town import Town
 from lidar_synth.mixing import MixedScans, to_item
 from lidar_synth.noise import keyed_rng

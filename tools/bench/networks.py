@@ -37,8 +37,8 @@ from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint
 from lidar_synth.generate.flow.path import velocity_loss
 from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.hdit.hdit import HDiT
+from lidar_synth.geometry import load_sensor
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.train.cache import ImageCache
 from lidar_synth.lab.train.data import Batches
 from lidar_synth.lab.train.loop import steps

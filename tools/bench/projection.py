@@ -16,6 +16,7 @@ from timing import print_table, time_in_turns
 from typer import Argument, run
 
 from lidar_synth.formats.points import read_points
+from lidar_synth.geometry import Scan, Sensor, load_sensor
 from lidar_synth.geometry.projection import (
     locate,
     project,
@@ -23,8 +24,6 @@ from lidar_synth.geometry.projection import (
     unproject,
 )
 from lidar_synth.geometry.projection.batch import project_batch
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 
 def random_points(sensor: Sensor, count: int = 120_000) -> np.ndarray:

@@ -18,7 +18,7 @@ from typer import Argument, run
 
 from lidar_synth import Scan, Town, load_generator, load_sensor, project, unproject
 from lidar_synth.formats.points import read_points
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 from lidar_synth.geometry.transfer import Mount, Transfer
 from lidar_synth.geometry.transfer.surfaces import estimate
 

@@ -11,8 +11,8 @@ from lidar_synth.generate.checkpoint import (
     save_checkpoint,
 )
 from lidar_synth.generate.models import build_network
+from lidar_synth.geometry import load_sensor
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
-from lidar_synth.geometry.sensor import load_sensor
 
 
 def write_untrained(path: Path) -> Path:

@@ -19,8 +19,8 @@ from typer import run
 
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.files.markdown import escape_markdown
+from lidar_synth.geometry import RangeImage
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.lab.train import reconstruct
 
 SEED = 7

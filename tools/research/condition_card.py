@@ -43,8 +43,8 @@ from typer import run
 
 from lidar_synth import Scan, Town, load_generator, open_scans
 from lidar_synth.files.markdown import escape_markdown
+from lidar_synth.geometry import Sensor
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.conditions import AGREEMENTS
 from lidar_synth.lab.evaluate.segmentation import Judge, load_judge
 from lidar_synth.lab.town import STRETCH_FRAMES

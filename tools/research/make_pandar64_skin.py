@@ -16,8 +16,7 @@ from scipy.stats import wasserstein_distance
 from typer import run
 
 from lidar_synth.files.parsing import read_arrays
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry import Scan, Sensor, load_sensor
 from lidar_synth.lab.town import STRETCH_FRAMES, Town, fit_skin, load_skin
 from lidar_synth.lab.town.returns import LEVELS, ReturnNoise
 from lidar_synth.lab.town.skin.domains import Domain, returns_of

@@ -20,9 +20,8 @@ from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.pandaset_cuboids import BOXES
 from lidar_synth.generate.boxed import add_boxes
+from lidar_synth.geometry import Boxes, RangeImage, Scan, load_sensor
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
-from lidar_synth.geometry.sensor import load_sensor
 
 SAMPLE = Path("lidar_synth/samples/pandaset")
 SENSOR = load_sensor("pandar64")

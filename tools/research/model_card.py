@@ -43,9 +43,8 @@ from lidar_synth.generate.checkpoint import CODEC, load_checkpoint
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.flow.guidance import autoguide
 from lidar_synth.generate.loading import find_model, load_generator
+from lidar_synth.geometry import SYNTHETIC, Scan, load_sensor
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import SYNTHETIC, Scan
-from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.evaluate import Metric, Score, bootstrap
 from lidar_synth.lab.evaluate.isolated import count_isolated, share_of_isolated
 from lidar_synth.lab.evaluate.segmentation import (

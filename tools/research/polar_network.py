@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import NAMES
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.segmentation import tabulate
 from lidar_synth.lab.evaluate.segmenter import CircularConv
 from lidar_synth.lab.proof import Job

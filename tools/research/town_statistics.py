@@ -18,9 +18,8 @@ from tqdm import tqdm
 from typer import run
 
 from lidar_synth.formats import open_scans
+from lidar_synth.geometry import RangeImage, Scan, load_sensor
 from lidar_synth.geometry.projection import laser_rows, project
-from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 
 GROUPS = [

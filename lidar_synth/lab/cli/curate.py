@@ -149,7 +149,7 @@ def _scores(
     from lidar_synth.errors import ConfigError
     from lidar_synth.files.disk import hash_of_names
     from lidar_synth.formats import open_scans
-    from lidar_synth.geometry.scan import scan_hash
+    from lidar_synth.geometry import scan_hash
     from lidar_synth.lab.curate import (
         FILE,
         keep_features_in,

@@ -10,7 +10,7 @@ from typer import Argument, BadParameter, Option, echo
 from lidar_synth.cli.options import Json, Reading, drop_missing, options_from
 
 if TYPE_CHECKING:
-    from lidar_synth.geometry.scan import Source
+    from lidar_synth.geometry import Source
 
 
 @options_from(Reading, after="sensor")

@@ -51,8 +51,7 @@ def fit_from_scans(
     from lidar_synth.errors import ConfigError
     from lidar_synth.files.disk import write_file
     from lidar_synth.formats import open_scans
-    from lidar_synth.geometry.scan import spread
-    from lidar_synth.geometry.sensor import sensor_yaml
+    from lidar_synth.geometry import sensor_yaml, spread
     from lidar_synth.lab.fitting import fit_sensor
 
     if out.suffix not in (".yaml", ".yml"):

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE, NAMES
 from lidar_synth.generate.support import find_unsupported
+from lidar_synth.geometry import RangeImage, Scan
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import RangeImage, Scan
 
 RANGE_BINS = 64
 """Bins of the histogram of ranges, from 0 to the sensor's range_max."""

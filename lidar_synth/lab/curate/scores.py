@@ -22,9 +22,8 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.files.processes import map_in_processes
+from lidar_synth.geometry import Sensor, Source
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Source
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.curate.duplicates import most_similar
 from lidar_synth.lab.curate.features import MEASURES, RANGE_BINS, features
 from lidar_synth.lab.curate.store import Store, measure

@@ -19,7 +19,7 @@ from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import sha256, write_arrays
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.files.processes import map_in_processes
-from lidar_synth.geometry.scan import Scan, Source, scan_hash
+from lidar_synth.geometry import Scan, Source, scan_hash
 
 VERSION = 1
 """Of the extractors' arithmetic; a change of it makes all features anew."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry import Scan, Source
 from lidar_synth.lab.evaluate.cache import extract_all
 from lidar_synth.lab.evaluate.features import Extractor, find_weights, load_published
 from lidar_synth.lab.evaluate.leakage import refuse_training_data

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
+from lidar_synth.geometry import Scan
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.evaluate.segmentation import Judge, mean_iou
 from lidar_synth.lab.evaluate.statistics import Statistic, share
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.cache import Cached, weights_hash
 from lidar_synth.lab.evaluate.distances import frechet_distance, squared_mmd
 from lidar_synth.lab.evaluate.intervals import extrapolated_frechet

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidar_synth.datasets.classes import NAMES
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.statistics import Counts, Statistic
 
 RANGE = 8.0, 35.0

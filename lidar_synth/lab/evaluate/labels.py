@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.r2flow import BINS, FAR, FIELD, NEAR
 from lidar_synth.lab.evaluate.statistics import Sparse
 

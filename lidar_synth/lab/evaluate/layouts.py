@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import BOXED, GROUND
 from lidar_synth.errors import DataError
 from lidar_synth.generate.boxed import TOLERANCE
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.layout import CODES, Layout, layout_image
 from lidar_synth.geometry.layout.raster import depth_of
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
 
 LEAST_RAYS = 20
 LEAST_POINTS = 10

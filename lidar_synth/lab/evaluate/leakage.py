@@ -33,7 +33,7 @@ from lidar_synth.formats.models import models_of
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.generate.generator import Generator
 from lidar_synth.generate.loading import load_generator
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry import Scan, Source
 from lidar_synth.lab.town.export import SETTINGS
 
 

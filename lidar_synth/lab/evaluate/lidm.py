@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 
 Floats = NDArray[np.float32]
 

@@ -17,8 +17,7 @@ import torch.distributed
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.lab.evaluate.cache import checked
 from lidar_synth.lab.evaluate.distances import frechet_distance
 from lidar_synth.lab.evaluate.features import (

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate import lidm
 from lidar_synth.lab.evaluate.isolated import count_isolated, isolated_ratio
 from lidar_synth.lab.evaluate.labels import CLASSES, class_histogram

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from lidar_synth.datasets.classes import LABELS
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry import Scan, Source
 from lidar_synth.labels.objects import Object, instances_of, objects_of
 
 Floats = NDArray[np.float64]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.geometry import Scan
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Scan
 
 RANGE_STEP = 0.5
 RANGE_BINS = 500

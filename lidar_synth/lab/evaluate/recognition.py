@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Source
+from lidar_synth.geometry import Source
 from lidar_synth.lab.evaluate.distances import frechet_distance, squared_mmd
 from lidar_synth.lab.evaluate.isolated import count_isolated, share_of_isolated
 from lidar_synth.lab.evaluate.segmentation import class_ious, mean_iou

@@ -24,7 +24,7 @@ from lidar_synth.files.disk import hash_of_names, read_values
 from lidar_synth.files.parsing import read_facts
 from lidar_synth.formats.point_labels import decode_labels
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
-from lidar_synth.geometry.scan import Scan, Source, scan_hash
+from lidar_synth.geometry import Scan, Source, scan_hash
 from lidar_synth.lab.evaluate.labels import require_label
 from lidar_synth.lab.evaluate.segmentation import load_judge, mean_iou, tabulate
 from lidar_synth.lab.evaluate.street_judge import load_archive

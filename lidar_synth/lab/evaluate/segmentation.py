@@ -23,9 +23,8 @@ from torch import Tensor, nn
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_file, write_file
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.labels import require_label
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
 

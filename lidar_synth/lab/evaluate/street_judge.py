@@ -18,8 +18,8 @@ from torch import Tensor
 
 from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError
+from lidar_synth.geometry import Scan
 from lidar_synth.geometry.projection import carry
-from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.evaluate.extractors.archive import Archive
 from lidar_synth.lab.evaluate.extractors.bonnetal import (
     Segmenter,

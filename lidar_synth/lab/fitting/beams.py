@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry import Scan
 from lidar_synth.geometry.lines import nearest_beams, residuals
-from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.fitting.model import CAP, Cloud, Model, refine
 from lidar_synth.lab.fitting.peaks import beam_peaks
 from lidar_synth.lab.fitting.points import gather, rings_of_file

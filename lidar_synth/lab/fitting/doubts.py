@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.files.parsing import parse_yaml
-from lidar_synth.geometry.sensor import presets
+from lidar_synth.geometry import presets
 from lidar_synth.lab.fitting.azimuths import FAR, FEW, FEWEST, Azimuths
 
 Floats = NDArray[np.float64]

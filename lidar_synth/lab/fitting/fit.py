@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.geometry import Scan, Sensor, Source, spread
 from lidar_synth.geometry.lines import nearest_beams, residuals
-from lidar_synth.geometry.scan import Scan, Source, spread
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.azimuths import Azimuths, fit_azimuths, turn_of
 from lidar_synth.lab.fitting.beams import NEAREST, Beams, fit_beams, room_of
 from lidar_synth.lab.fitting.doubts import doubts, name_vendor

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry import Scan, Sensor, require_finite
 from lidar_synth.geometry.lines import Floats
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
-from lidar_synth.geometry.scan import Scan, require_finite
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.model import Cloud
 
 ONE_TURN = (0.7, 1.3)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from lidar_synth.geometry import spread
 from lidar_synth.geometry.lines import nearest_beams, residuals
-from lidar_synth.geometry.scan import spread
 from lidar_synth.lab.fitting.model import CAP, Cloud, Model
 
 Floats = NDArray[np.float64]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.bake.conditions import conditions, conditions_for
 from lidar_synth.generate.loading import load_generator
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 from lidar_synth.viz import write_view
 
 STEPS = 10

@@ -48,8 +48,8 @@ from lidar_synth.generate.checkpoint import (
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.models import assemble
 from lidar_synth.generate.models.lidm.diffusion import schedule_times
+from lidar_synth.geometry import Sensor, presets
 from lidar_synth.geometry.normalize import Normalisation
-from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.lab.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
 
 STEPS = 50

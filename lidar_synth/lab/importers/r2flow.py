@@ -27,8 +27,8 @@ from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.models import assemble
 from lidar_synth.generate.models.positions import BASES, LEARNED
+from lidar_synth.geometry import Sensor, presets
 from lidar_synth.geometry.normalize import Normalisation
-from lidar_synth.geometry.sensor import Sensor, presets
 
 HEADS = (2, 4, 8, 16)
 MAPPING_DEPTH = 2

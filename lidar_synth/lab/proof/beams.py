@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.projection import laser_rows
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
 
 FEWEST = 4
 

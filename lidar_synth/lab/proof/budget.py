@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.pools import SKIN_STREETS

@@ -16,7 +16,7 @@ from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI, TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError, ProcessError
 from lidar_synth.files.disk import read_values, write_file
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.labels import require_label
 from lidar_synth.lab.evaluate.segmentation import tabulate
 from lidar_synth.lab.proof.arms import REAL, ArmStage, options_of

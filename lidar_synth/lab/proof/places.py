@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Source
+from lidar_synth.geometry import Source
 from lidar_synth.labels.edit.unboxed import join_cubes
 
 log = logging.getLogger(__name__)

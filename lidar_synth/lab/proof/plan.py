@@ -10,8 +10,7 @@ from typing import Any
 
 from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.files.disk import hash_of_names
-from lidar_synth.geometry.scan import spread
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor, spread
 from lidar_synth.lab.proof.arms import Row
 from lidar_synth.lab.proof.places import Places
 from lidar_synth.lab.proof.pools import MOST_SKIN_SCANS

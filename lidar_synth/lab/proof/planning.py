@@ -14,8 +14,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import layout_of
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.generate.devices import check_device
-from lidar_synth.geometry.scan import LABELLED_ONLY, Scan, Source, spread
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import LABELLED_ONLY, Scan, Sensor, Source, spread
 from lidar_synth.lab.evaluate.leakage import content_of, recordings_of
 from lidar_synth.lab.proof.arms import rows
 from lidar_synth.lab.proof.beams import coarser, keep_beams

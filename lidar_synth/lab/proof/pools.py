@@ -22,8 +22,7 @@ from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model, load_generator
-from lidar_synth.geometry.scan import Scan, spread
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Scan, Sensor, spread
 from lidar_synth.geometry.transfer import Measurement, Response, Transfer
 from lidar_synth.lab.evaluate.leakage import town
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin

@@ -22,7 +22,7 @@ from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_sealed, seal
 from lidar_synth.files.processes import map_in_processes, usable_cores
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry import Scan, Source
 from lidar_synth.lab.evaluate.leakage import refuse_leaks
 from lidar_synth.lab.proof.arms import Row
 from lidar_synth.lab.proof.beams import keep_beams

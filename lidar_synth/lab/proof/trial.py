@@ -18,9 +18,8 @@ from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.segmentation import Images, confusion
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
 from lidar_synth.lab.proof.arms import REAL, ArmStage, Row, policy_of

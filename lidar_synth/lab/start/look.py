@@ -13,9 +13,9 @@ import numpy as np
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
+from lidar_synth.geometry import Scan, spread
 from lidar_synth.geometry.agreement import agreement
 from lidar_synth.geometry.overlap import count_overlapping
-from lidar_synth.geometry.scan import Scan, spread
 from lidar_synth.lab.fitting import SensorFit, fit_sensor
 from lidar_synth.lab.proof.places import by_drive, is_shuffled, names_of
 

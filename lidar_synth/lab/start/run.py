@@ -18,7 +18,7 @@ from lidar_synth.files.processes import usable_cores
 from lidar_synth.formats.camera_boxes import CameraBoxes
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model
-from lidar_synth.geometry.sensor import Sensor, presets, sensor_yaml
+from lidar_synth.geometry import Sensor, presets, sensor_yaml
 from lidar_synth.lab.proof import ProofSettings, prove
 from lidar_synth.lab.proof.detection import DetectionSettings, prove_detection
 from lidar_synth.lab.proof.detection.study import DetectionWork

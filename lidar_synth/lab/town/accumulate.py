@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.kitti360 import label_values
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.kitti360.accumulated import REACH, SPACING, write_cloud
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.town.world import STRETCH_FRAMES

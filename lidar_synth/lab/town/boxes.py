@@ -8,7 +8,7 @@ or roll.
 
 import numpy as np
 
-from lidar_synth.geometry.scan import Boxes
+from lidar_synth.geometry import Boxes
 from lidar_synth.lab.town.camera import CAMERA, pixel_rays
 from lidar_synth.lab.town.cast import Snapshot, trace
 from lidar_synth.lab.town.meshes import Array, Floats

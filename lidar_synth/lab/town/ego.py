@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 from lidar_synth.lab.town.meshes import Array
 from lidar_synth.lab.town.objects import assemble
 from lidar_synth.lab.town.solid import Solid

@@ -17,8 +17,7 @@ from tqdm import tqdm
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry import Boxes, Scan, Sensor, load_sensor
 from lidar_synth.lab.town.boxes import box_values
 from lidar_synth.lab.town.cast import MISS, SceneHits, Snapshot
 from lidar_synth.lab.town.materials import SurfaceTable

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 from lidar_synth.lab.town.cast import SceneHits, Snapshot
 from lidar_synth.lab.town.catalogue import TABLES, Rng
 from lidar_synth.lab.town.materials import SurfaceTable, column

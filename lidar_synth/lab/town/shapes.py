@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.scan import Boxes
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry import Boxes, Sensor, load_sensor
 from lidar_synth.lab.town.bodies import PHASES, cyclist, motorcyclist, sitter, walker
 from lidar_synth.lab.town.catalogue import pick_colour
 from lidar_synth.lab.town.ego import HEIGHT

@@ -16,8 +16,7 @@ from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import json_checksum
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.geometry.scan import SYNTHETIC, Scan
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry import SYNTHETIC, Scan, Sensor, load_sensor
 from lidar_synth.lab.town.boxes import boxes_of
 from lidar_synth.lab.town.camera import CAMERA
 from lidar_synth.lab.town.cast import SceneHits, Snapshot

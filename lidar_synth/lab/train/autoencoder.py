@@ -19,9 +19,8 @@ from lidar_synth.generate.flow.path import METRICS, Example, Metric
 from lidar_synth.generate.models.convolution import Norm, WrapConv
 from lidar_synth.generate.models.network import Autoencoder
 from lidar_synth.generate.models.objective import Losses, Objective
+from lidar_synth.geometry import RangeImage, Sensor
 from lidar_synth.geometry.normalize import TensorFormat
-from lidar_synth.geometry.scan import RangeImage
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.train.config import TrainConfig
 from lidar_synth.lab.train.data import Batch, Batches
 from lidar_synth.lab.train.stage import Stage, Task

@@ -17,10 +17,9 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.formats import RangePNG, ScanFiles
 from lidar_synth.generate.codec import Codec
+from lidar_synth.geometry import Scan, Sensor, Source
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.train.arrays import FILES, Arrays, Layout, make_arrays
 from lidar_synth.lab.train.ranks import ALONE, Ranks
 

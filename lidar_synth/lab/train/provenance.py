@@ -9,7 +9,7 @@ import torch
 
 from lidar_synth.datasets.recordings import Recordings, inherited
 from lidar_synth.formats import BankScans, ScanFiles, layout_of
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 from lidar_synth.lab.evaluate.leakage import recordings_of, town
 from lidar_synth.lab.train.config import PARENTS, Data, Run
 

@@ -33,7 +33,7 @@ from lidar_synth.generate.flow.path import Example, Metric, velocity_loss
 from lidar_synth.generate.generator import Generator
 from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder
 from lidar_synth.generate.models.encoders.clip_views import ClipViewEncoder, find_clip
-from lidar_synth.geometry.scan import RangeImage, Scan, Source
+from lidar_synth.geometry import RangeImage, Scan, Source
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.train.cache import Other, cache_latents, cache_scans
 from lidar_synth.lab.train.config import Data, Run

@@ -25,8 +25,8 @@ from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network, network_class
+from lidar_synth.geometry import Sensor, load_sensor
 from lidar_synth.geometry.normalize import Normalisation
-from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.train.config import (
     ConditionSection,
     NetworkSection,

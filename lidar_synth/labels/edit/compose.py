@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import MAX_INSTANCES, SEMANTIC_KITTI
-from lidar_synth.geometry.scan import SYNTHETIC, Scan
+from lidar_synth.geometry import SYNTHETIC, Scan
 from lidar_synth.labels.edit.rays import ScanRays
 
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, TRAIN_ID
 from lidar_synth.errors import DataError
+from lidar_synth.geometry import Boxes, Scan, wrap_angle
 from lidar_synth.geometry.overlap import find_overlapping
-from lidar_synth.geometry.scan import Boxes, Scan, wrap_angle
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.rays import rays_from
 from lidar_synth.geometry.transfer.surfaces import (

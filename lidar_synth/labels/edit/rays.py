@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.geometry.transfer.kernels import WIDEST
 from lidar_synth.geometry.transfer.surfaces import as_fired, rings_of
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND
+from lidar_synth.geometry import RangeImage, Scan
 from lidar_synth.geometry.projection import carry, locate
-from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.labels.edit.rays import ScanRays
 from lidar_synth.labels.objects import THINGS
 

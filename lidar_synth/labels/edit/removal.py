@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE, has_ground
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.labels.boxes import grow_box, widen_boxes
 from lidar_synth.labels.edit.compose import replace_returns
 from lidar_synth.labels.edit.fill import continue_surfaces

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import BOXED, GROUND, NAMES
 from lidar_synth.errors import DataError, choose
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.labels.boxes import grow_box
 from lidar_synth.labels.edit.redraw import Model
 from lidar_synth.labels.edit.removal import remove_returns

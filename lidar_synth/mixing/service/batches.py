@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.generator import Generated
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.mixing import MixedScans
 
 

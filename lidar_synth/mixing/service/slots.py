@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry import RangeImage
 from lidar_synth.mixing.service.ledger import COUNTERS
 
 _WORDS = 4096  # bytes for the last words

@@ -19,7 +19,7 @@ from PIL import Image
 from pyquaternion import Quaternion
 from typer import run
 
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.town import Town
 from lidar_synth.lab.town.world import STRETCH_FRAMES
 

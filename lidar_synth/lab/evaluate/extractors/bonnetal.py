@@ -16,8 +16,7 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.torch_files import MISFITS
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.lab.evaluate.extractors.archive import Archive, load_weights
 from lidar_synth.lab.evaluate.extractors.darknet import BLOCKS, RangeNet
 from lidar_synth.lab.evaluate.extractors.inputs import (

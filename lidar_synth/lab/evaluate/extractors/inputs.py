@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.geometry import Scan, Sensor, presets
 from lidar_synth.geometry.projection import locate, project
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.lab.evaluate.lidm import SENSOR
 
 Floats = NDArray[np.float32]

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.extractors.archive import Archive, load_weights
 from lidar_synth.lab.evaluate.extractors.inputs import preparation
 from lidar_synth.lab.evaluate.extractors.per_scan import PerScan, some

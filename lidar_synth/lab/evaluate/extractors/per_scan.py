@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 
 @dataclass(frozen=True)

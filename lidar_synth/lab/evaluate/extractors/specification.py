@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 
 FOLDER_VARIABLE = "LIDAR_SYNTH_METRICS"
 """Environment variable that names the folder with the weights of all extractors."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.extractors.archive import Archive, load_weights
 from lidar_synth.lab.evaluate.extractors.inputs import FURTHEST, preparation
 from lidar_synth.lab.evaluate.extractors.per_scan import PerScan, some

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lidar_synth.errors import ConfigError, suggest
+from lidar_synth.geometry import Scan, Sensor, presets
 from lidar_synth.geometry.projection import locate, project, unproject
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.lab.evaluate.measures import KINDS
 
 FEATURES = "frechet"

@@ -7,7 +7,7 @@ enter it in ``ARMS``.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry import Scan, Source
 from lidar_synth.lab.proof.arms import EPOCHS
 from lidar_synth.lab.proof.detection.network import collate, sample
 from lidar_synth.lab.town.returns import CALIBRATED_ON

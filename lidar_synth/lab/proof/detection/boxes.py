@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry import Boxes, Scan
 
 CLASSES = {
     "car": ("Car", "Van"),

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry import Scan
 from lidar_synth.lab.proof.detection.bev import Found
 from lidar_synth.lab.proof.detection.pillars import (
     PillarBackbone,

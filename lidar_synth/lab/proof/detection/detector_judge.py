@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.torch_files import load_pickle
-from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.geometry import Scan, Source
 from lidar_synth.lab.evaluate.extractors.archive import load_weights
 from lidar_synth.lab.proof.detection.bev import Found
 from lidar_synth.lab.proof.detection.boxes import (

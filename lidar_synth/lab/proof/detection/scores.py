@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry import Scan
 from lidar_synth.geometry.overlap import footprints
-from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.proof.detection.bev import REACH, Found
 from lidar_synth.lab.proof.detection.boxes import (
     LEAST,

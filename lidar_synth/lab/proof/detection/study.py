@@ -22,8 +22,8 @@ from lidar_synth.formats import open_scans
 from lidar_synth.formats.camera_boxes import CameraBoxes
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.generate.devices import check_device
+from lidar_synth.geometry import Source
 from lidar_synth.geometry.overlap import count_overlapping
-from lidar_synth.geometry.scan import Source
 from lidar_synth.lab.proof.arms import EPOCHS
 from lidar_synth.lab.proof.detection.arms import (
     ARMS,

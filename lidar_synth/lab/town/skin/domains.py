@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.projection import laser_rows
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.surfaces import as_fired
 from lidar_synth.lab.town.catalogue import Rng
 from lidar_synth.lab.town.skin.features import (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 from lidar_synth.lab.town.skin.domains import PART_LEVELS, STRATUM_LEVELS, Domain
 from lidar_synth.lab.town.skin.features import (
     BAND,

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]

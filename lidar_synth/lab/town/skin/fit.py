@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry import Scan, Sensor, Source, load_sensor
 from lidar_synth.lab.town.returns import LEVELS, ReturnNoise
 from lidar_synth.lab.town.skin.domains import Domain, returns_of
 from lidar_synth.lab.town.skin.estimate import estimate_skin

@@ -17,7 +17,7 @@ from safetensors.numpy import load, save
 
 from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.files.disk import read_file, write_file
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 from lidar_synth.lab.town.skin.features import (
     BAND,
     BANDS,

@@ -19,8 +19,8 @@ from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.generate.checkpoint import CODEC, Checkpoint, Header, join
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.generator import Generator
+from lidar_synth.geometry import RangeImage, Scan
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.lab.evaluate.neighbours import nearest_training
 from lidar_synth.lab.evaluate.segmentation import load_judge
 from lidar_synth.lab.train.adaptation.scans import HELD, TRAIN

@@ -26,7 +26,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.models import build_network
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 from lidar_synth.lab.train.start import limit_ranges
 
 ANGLES = "angles.cells"

@@ -18,7 +18,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.loading import find_model
-from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry import Sensor
 from lidar_synth.lab.train.adaptation.card import figures, provenance_of, write_card
 from lidar_synth.lab.train.adaptation.regrid import (
     check_movable,

@@ -23,11 +23,10 @@ from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats import RangeImages, ScanFiles
 from lidar_synth.formats.npz import write_range_image
 from lidar_synth.generate.codec import Latent
+from lidar_synth.geometry import RangeImage, Scan, Sensor, spread
 from lidar_synth.geometry.agreement import MOST_OUTSIDE, agreement
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import RangeImage, Scan, spread
-from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.leakage import content_of, contents, recordings_of
 
 FEWEST = 12

@@ -16,7 +16,7 @@ from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.flow.distill import UNIFORM, check_uniform
 from lidar_synth.generate.flow.solvers import read_grid
 from lidar_synth.generate.models import build_network
-from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.geometry import load_sensor
 from lidar_synth.lab.train.config.sections import Run
 from lidar_synth.lab.train.config.training import DistillConfig, TrainConfig
 

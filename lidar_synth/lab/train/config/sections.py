@@ -11,8 +11,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.formats import OnBad, open_scans
 from lidar_synth.generate.checkpoint import NetworkSpec
 from lidar_synth.generate.models import encoders_of, network_class
-from lidar_synth.geometry.scan import Source
-from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.geometry import Sensor, Source, load_sensor
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.train.state import Recipe
 
