@@ -7,7 +7,8 @@ Every message states what was given, what was expected and what to type, in that
                     "copy the file again, or skip it with on_bad='skip'")
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import TypeVar
 
@@ -93,3 +94,25 @@ def choose(kind: str, name: str, table: Mapping[str, Choice], hint: str = "") ->
             f"{kind} {name!r}", f"one of {', '.join(map(repr, table))}", hint
         )
     return table[name]
+
+
+@contextmanager
+def needs(extra: str, what: str, otherwise: str = "") -> Iterator[None]:
+    """Say what to install if an import fails.
+
+    Args:
+        extra: of this package, which has the library.
+        what: the subject of "cannot be imported", such as ``"engine 'ray', but ray"``.
+        otherwise: what else the user can do.
+
+    Raises:
+        LibraryError: if a library cannot be imported.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise LibraryError(
+            f"{what} cannot be imported ({error})",
+            f"the extra {extra}",
+            f"pip install 'lidar_synth[{extra}]'{otherwise}",
+        ) from error

@@ -14,7 +14,7 @@ from typing import Any
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
-from lidar_synth.errors import ConfigError, FileError, LibraryError
+from lidar_synth.errors import ConfigError, FileError, LibraryError, needs
 
 # Lost actors per worker, without a finished shard in between, after which the bake fails.
 _LOSSES = 5
@@ -44,7 +44,8 @@ def bake_on_ray(
         ConfigError: if no cluster is running at the address.
         FileError, DataError: as ``bake_shard``.
     """
-    ray = _import_ray()
+    with needs("ray", "engine 'ray', but ray"):
+        import ray
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     started = not ray.is_initialized()
     if started:
@@ -116,15 +117,3 @@ def _work_off(
         if waiting:
             next_number = waiting.popleft()
             running[actor.bake.remote(next_number)] = actor, next_number
-
-
-def _import_ray() -> Any:
-    try:
-        import ray
-    except ImportError as error:
-        raise LibraryError(
-            f"engine 'ray', but ray cannot be imported ({error})",
-            "the extra ray",
-            "pip install 'lidar_synth[ray]'",
-        ) from error
-    return ray

@@ -15,7 +15,7 @@ from lidar_synth.bake.folder import LOGS
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
-from lidar_synth.errors import ConfigError, FileError, LibraryError
+from lidar_synth.errors import ConfigError, FileError, needs
 
 # Submitit's default of 5 minutes may be too short for a shard.
 _OPTIONS = {"cluster": "slurm", "timeout_min": 240}
@@ -48,7 +48,8 @@ def bake_on_slurm(
         ConfigError: if Slurm is not available, or on an option that submitit does not have.
         FileError: if a job failed; the others are cancelled.
     """
-    submitit = _import_submitit()
+    with needs("slurm", "engine 'slurm', but submitit"):
+        import submitit
     workers = min(resources.workers, len(numbers))
     executor = _executor(submitit, plan, resources.slurm)
     jobs = executor.map_array(
@@ -94,15 +95,3 @@ def _executor(submitit: Any, plan: BakePlan, options: dict[str, str | int]) -> A
 def _logs(plan: BakePlan) -> Path:
     """The folder of the jobs' logs: in the bank's folder, or, for a URL, in this one."""
     return Path(LOGS) if isinstance(plan.out, str) else plan.out / LOGS
-
-
-def _import_submitit() -> Any:
-    try:
-        import submitit
-    except ImportError as error:
-        raise LibraryError(
-            f"engine 'slurm', but submitit cannot be imported ({error})",
-            "the extra slurm",
-            "pip install 'lidar_synth[slurm]'",
-        ) from error
-    return submitit

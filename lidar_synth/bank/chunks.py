@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import LibraryError
+from lidar_synth.errors import needs
 
 _GZIP_LEVEL = 1
 _DEFLATE_RATIO = 1032  # highest compression ratio that deflate can reach
@@ -138,14 +138,9 @@ def filters(compression: str) -> Mapping[str, Any]:
     """
     if compression == "gzip":
         return {"shuffle": True, "compression": "gzip", "compression_opts": _GZIP_LEVEL}
-    try:
+    instead = ", or bake with compression gzip."
+    with needs("blosc2", "a bank with Blosc2, but hdf5plugin", instead):
         import hdf5plugin
-    except ImportError as error:
-        raise LibraryError(
-            f"a bank with Blosc2, but hdf5plugin cannot be imported ({error})",
-            "the extra blosc2",
-            "pip install 'lidar_synth[blosc2]', or bake with compression gzip.",
-        ) from error
     return dict(
         hdf5plugin.Blosc2(cname="zstd", clevel=3, filters=hdf5plugin.Blosc2.BITSHUFFLE)
     )

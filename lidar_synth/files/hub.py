@@ -17,8 +17,8 @@ from lidar_synth.errors import (
     ConfigError,
     DataError,
     FileError,
-    LibraryError,
     LidarSynthError,
+    needs,
 )
 
 LICENCES = frozenset(
@@ -214,15 +214,10 @@ def _require_licence(there: Repository, card: bytes) -> None:
 def _hub_errors(url: str) -> Iterator[None]:
     """Errors of the hub as those of the package."""
     try:
-        yield
+        with needs("hub", f"{url}, but huggingface_hub"):
+            yield
     except LidarSynthError:
         raise
-    except ImportError as error:
-        raise LibraryError(
-            f"{url}, but huggingface_hub cannot be imported ({error})",
-            "the extra hub",
-            "pip install 'lidar_synth[hub]'",
-        ) from error
     except Exception as error:  # the library's, and those of the client that it uses
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FileError(

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthError
+from lidar_synth.errors import ConfigError, DataError, LidarSynthError, needs
 from lidar_synth.files.disk import open_file
 from lidar_synth.formats.cloud import Field, check_fields, to_arrays, to_records
 from lidar_synth.formats.description import Description, from_comments, to_comments
@@ -117,7 +117,7 @@ class MCAP(CloudFiles):
 
 def encode_mcap(scan: Scan) -> bytes:
     """The file of a scan."""
-    with _library():
+    with needs("mcap", "an MCAP file, but a library"):
         from mcap_ros2.writer import Writer
     records = to_records(scan)
     kinds = {np.dtype(f"<{name}"): number for number, name in TYPES.items()}
@@ -309,7 +309,7 @@ class Bounded:
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[BinaryIO, Any]]:
     """An open file and the library's reader of it; errors of the library as ``DataError``."""
-    with _library():
+    with needs("mcap", "an MCAP file, but a library"):
         import mcap_ros2.decoder  # noqa: F401 - the extra has both
         from mcap.reader import SeekingReader
     with open_file(path) as file:
@@ -322,16 +322,3 @@ def _opened(path: Path) -> Iterator[tuple[BinaryIO, Any]]:
             raise DataError(
                 f"{path} is damaged or no MCAP file ({error!r})", "an intact file"
             ) from error
-
-
-@contextmanager
-def _library() -> Iterator[None]:
-    """A missing library as an error that says what to install."""
-    try:
-        yield
-    except ImportError as error:
-        raise LibraryError(
-            f"an MCAP file, but a library cannot be imported ({error})",
-            "the extra mcap",
-            "pip install 'lidar_synth[mcap]'",
-        ) from error

@@ -23,7 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import NUSCENES, PANDASET, WAYMO
-from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthError
+from lidar_synth.errors import (
+    ConfigError,
+    DataError,
+    LibraryError,
+    LidarSynthError,
+    needs,
+)
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.folder import rows_of_rings
 from lidar_synth.formats.nuscenes import RINGS, drop_nearest
@@ -366,15 +372,10 @@ def _opened(path: Path) -> Iterator[Any]:
 @contextmanager
 def _errors(path: Path) -> Iterator[None]:
     try:
-        yield
+        with needs("py123d", f"{path} of py123d, but a library"):
+            yield
     except LidarSynthError:
         raise
-    except ImportError as error:
-        raise LibraryError(
-            f"{path} of py123d, but a library cannot be imported ({error})",
-            "the extra py123d",
-            "pip install 'lidar_synth[py123d]'",
-        ) from error
     except Exception as error:  # each library has its own classes
         raise DataError(
             f"{path} is damaged or no table of py123d ({error!r})", "an intact file"

@@ -7,7 +7,7 @@ import numpy as np
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.datasets.colours import COLOURS
-from lidar_synth.errors import LibraryError
+from lidar_synth.errors import needs
 from lidar_synth.geometry import Scan
 from lidar_synth.viz.scales import make_scales, point_values
 
@@ -36,14 +36,8 @@ def to_rerun(
         LibraryError: without the extra ``rerun``.
         ConfigError: on an unknown ``by``, or one that a scan does not have.
     """
-    try:
+    with needs("rerun", "rerun"):
         import rerun
-    except ImportError as error:
-        raise LibraryError(
-            f"rerun cannot be imported ({error})",
-            "the extra rerun",
-            "pip install 'lidar_synth[rerun]'",
-        ) from error
     given = [scans] if isinstance(scans, Scan) else list(scans)
     scales = make_scales(given)
     stream = rerun.RecordingStream(title)
