@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.geometry import (
     POINT_FIELDS,
     REAL,
@@ -70,9 +70,9 @@ class SampleMaker:
         boxed = boxes or getattr(policy, "clear", "same") != "same"
         self._notices = Notices(images, boxes, boxed)
         if isinstance(unboxed, str):
-            from lidar_synth.labels.edit.unboxed import make_handling  # loads networks
+            from lidar_synth.labels.edit.unboxed import HANDLING  # loads networks
 
-            unboxed = make_handling(unboxed)
+            unboxed = choose("unboxed", unboxed, HANDLING)
         self._without_unboxed = unboxed
         common = frozenset({*POINT_FIELDS, "boxes"}).intersection(*fields)
         self._augment: LabelPolicy | None = None

@@ -66,12 +66,11 @@ class Beams:
     parts: frozenset[str]
 
 
-def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud]:
+def fit_beams(scans: Sequence[Scan]) -> tuple[Beams | None, Cloud]:
     """Fit beams, mounting and motion to scans.
 
     Args:
         scans: of one sensor.
-        seed: of the choice of points.
 
     Returns:
         The beams, None if there are fewer than two; and all points with their rings of the file, if
@@ -85,21 +84,21 @@ def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud
     cloud = replace(
         cloud, ring=cloud.ring if ring is None else ring, kept=ring is not None
     )
-    part = _without_gaps(_some_points(cloud, POINTS, seed))
+    part = _without_gaps(_some_points(cloud, POINTS))
     still = Model(
         np.zeros(1), np.zeros(1), np.zeros(3), np.eye(3), np.zeros((len(scans), 6))
     )
-    best, quality = _attempt(part, still, seed)
+    best, quality = _attempt(part, still)
     if quality < GOOD:
         log.warning(
             "the points show no sharp beams from their origin: the sensor's place is "
             "searched, which takes minutes"
         )
         offset, turn = find_mount(
-            [cloud.points[cloud.scan == scan] for scan in range(len(scans))], seed
+            [cloud.points[cloud.scan == scan] for scan in range(len(scans))]
         )
         moved, better = _attempt(
-            part, replace(still, offset=offset, turn=turn), seed, frozenset({"mount"})
+            part, replace(still, offset=offset, turn=turn), frozenset({"mount"})
         )
         if better > quality:
             best = moved
@@ -110,12 +109,12 @@ def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud
         and not cloud.kept
         and not any(scan.time is not None for scan in scans)
     ):
-        best = _with_another_seam(part, best, quality, seed)
+        best = _with_another_seam(part, best, quality)
     return (Beams(best[0], source, best[1]) if best else None), cloud
 
 
 def _with_another_seam(
-    cloud: Cloud, best: tuple[Model, frozenset[str]], quality: float, seed: int
+    cloud: Cloud, best: tuple[Model, frozenset[str]], quality: float
 ) -> tuple[Model, frozenset[str]]:
     """The best fit with turns that start behind the sensor, as before, or on another side of it."""
     still = replace(
@@ -126,19 +125,19 @@ def _with_another_seam(
     )
     for seam in (0.25, 0.5, 0.75):
         turned = replace(cloud, time=(cloud.time + seam + 0.5) % 1.0 - 0.5)
-        other, better = _attempt(turned, still, seed, frozenset({"motion", "mount"}))
+        other, better = _attempt(turned, still, frozenset({"motion", "mount"}))
         if other and better > quality:
             best = other
             quality = better
     return best
 
 
-def _some_points(cloud: Cloud, count: int, seed: int) -> Cloud:
+def _some_points(cloud: Cloud, count: int) -> Cloud:
     use = np.flatnonzero(np.hypot(cloud.points[:, 0], cloud.points[:, 1]) > NEAREST)
     if cloud.kept:
         use = use[cloud.ring[use] >= 0]
     if len(use) > count:
-        use = np.sort(np.random.default_rng(seed).choice(use, count, replace=False))
+        use = np.sort(np.random.default_rng(0).choice(use, count, replace=False))
     return Cloud(
         cloud.points[use], cloud.scan[use], cloud.time[use], cloud.ring[use], cloud.kept
     )
@@ -153,10 +152,10 @@ def _without_gaps(cloud: Cloud) -> Cloud:
 
 
 def _grow(
-    cloud: Cloud, model: Model, parts: frozenset[str], seed: int
+    cloud: Cloud, model: Model, parts: frozenset[str]
 ) -> tuple[Model, frozenset[str]]:
     """The model with the parts that fit it, and with the beams that are peaks once it has them."""
-    few = _some_points(cloud, POINTS // 3, seed)
+    few = _some_points(cloud, POINTS // 3)
     for _ in range(1 if cloud.kept else ROUNDS):
         model, parts = _choose_parts(few, model, parts)
         again = None if cloud.kept else add_peaks(cloud, model)
@@ -167,13 +166,13 @@ def _grow(
 
 
 def _attempt(
-    cloud: Cloud, still: Model, seed: int, parts: frozenset[str] = frozenset()
+    cloud: Cloud, still: Model, parts: frozenset[str] = frozenset()
 ) -> tuple[tuple[Model, frozenset[str]] | None, float]:
     """The best model from one mounting, its parts, and its quality."""
     model = _from_rings(cloud, still) if cloud.kept else add_peaks(cloud, still)
     if model is None:
         return None, 0.0
-    model, parts = _grow(cloud, model, parts, seed)
+    model, parts = _grow(cloud, model, parts)
     if "motion" in parts:
         model = _with_motion(cloud, model)
     quality = 0.0

@@ -61,7 +61,7 @@ _NARROW = 128  # sectors within which a tilt of a degree moves no point by more 
 _SECTORS = (64, 32, 16, 8, 4, 2, 1)
 
 
-def find_mount(scans: Sequence[Floats], seed: int = 0) -> tuple[Floats, Floats]:
+def find_mount(scans: Sequence[Floats]) -> tuple[Floats, Floats]:
     """(3,) offset and (3, 3) rotation of the sensor in the frame of the points.
 
     Each of some scans is searched alone, because the car's motion blurs some of them; the sharpest
@@ -69,13 +69,12 @@ def find_mount(scans: Sequence[Floats], seed: int = 0) -> tuple[Floats, Floats]:
 
     Args:
         scans: (N, 3) metres each.
-        seed: of the choice of points.
     """
     chosen = [scans[i] for i in spread(range(len(scans)), SCANS) if len(scans[i])]
     best = FLAT
     place = np.zeros(5)
     for scan in chosen:
-        sharp, found = _place_in(scan, -(-STARTS // len(chosen)), seed)
+        sharp, found = _place_in(scan, -(-STARTS // len(chosen)))
         if sharp > best:
             best = sharp
             place = found
@@ -125,7 +124,7 @@ def find_motion(cloud: Cloud, model: Model, scan: int) -> Floats:
     )
 
 
-def _place_in(points: Floats, starts: int, seed: int) -> tuple[float, Floats]:
+def _place_in(points: Floats, starts: int) -> tuple[float, Floats]:
     """The sharpness of one scan's elevations at its best place, and the place, from some starts on
     the grid."""
     points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
@@ -133,7 +132,7 @@ def _place_in(points: Floats, starts: int, seed: int) -> tuple[float, Floats]:
     every = max(len(points) // GRID_POINTS, 1)
     dense = points[(part * _NARROW / 2).astype(np.int64) % every == 0]
     if len(points) > POINTS:
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         points = rng.choice(points, POINTS, replace=False)
     best = FLAT
     found = np.zeros(5)

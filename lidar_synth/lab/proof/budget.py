@@ -8,6 +8,7 @@ from math import ceil
 import numpy as np
 import torch
 
+from lidar_synth.bake.shard import torch_threads
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter
@@ -97,24 +98,22 @@ def measure_step(
     parts = images(scans, sensor)
     batch = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     height = torch.from_numpy(np.sin(sensor.ray_angles()[0])).to(device)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    if half is None:
-        half = height.device.type != "cpu" or faster_in_bfloat16()
     times: list[float] = []
 
     def watch(step: int) -> None:
         height.max().item()  # waits for a GPU
         times.append(time.perf_counter())
 
-    train_segmenter(
-        RangeSegmenter(widths=settings.widths).to(device),
-        [batch] * 4,
-        height,
-        4,
-        progress=False,
-        half=half,
-        watch=watch,
-    )
-    torch.set_num_threads(threads)
+    with torch_threads(1):
+        if half is None:
+            half = height.device.type != "cpu" or faster_in_bfloat16()
+        train_segmenter(
+            RangeSegmenter(widths=settings.widths).to(device),
+            [batch] * 4,
+            height,
+            4,
+            progress=False,
+            half=half,
+            watch=watch,
+        )
     return half, float(np.diff(times).min())

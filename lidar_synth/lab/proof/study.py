@@ -5,16 +5,15 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
+from lidar_synth.bake.shard import torch_threads
 from lidar_synth.datasets.recordings import PLACES, TOWN, seen_by
 from lidar_synth.errors import DataError
 from lidar_synth.files.claims import claim
@@ -106,7 +105,8 @@ class Trainings:
         expected = self.plan.seconds(row)
         if self.deadline is not None and time.time() + expected > self.deadline:
             return False
-        with _one_thread():
+        # The trainings share the cores among them.
+        with torch_threads(1):
             outcomes = run_trainer(self.trainer, self._job(row, pairs))
         for pair in pairs:
             write_file(self.path(row, pair), seal(to_values(outcomes[pair[0]])))
@@ -141,17 +141,6 @@ class Trainings:
             pool_folders=folders,
             device=plan.device,
         )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute on one thread: the trainings share the cores among them."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 _pool = lru_cache(maxsize=2)(read_pool)

@@ -19,14 +19,11 @@ def cosine(step: int, warmup: int, iterations: int) -> float:
     return (1 + math.cos(math.pi * (step - warmup) / max(1, iterations - warmup))) / 2
 
 
-def trapezoid(
-    step: int, warmup: int, iterations: int, decay: float = 1 - PLATEAU
-) -> float:
+def trapezoid(step: int, warmup: int, iterations: int) -> float:
     """Linear from 0 over ``warmup`` steps, constant, then linear to 0 over the last quarter: up to
     there a run does not depend on ``iterations``, which may still be changed."""
-    return min(
-        1.0, (step + 1) / max(1, warmup), (iterations - step) / (decay * iterations)
-    )
+    falling = (iterations - step) / ((1 - PLATEAU) * iterations)
+    return min(constant(step, warmup, iterations), falling)
 
 
 def constant(step: int, warmup: int, iterations: int) -> float:

@@ -50,7 +50,6 @@ def redraw_hole(
     which: NDArray[np.intp],
     model: "Generator",
     seed: int,
-    start: float | None = None,
 ) -> Scan:
     """Replace the estimated content of a hole by that of a model.
 
@@ -61,13 +60,12 @@ def redraw_hole(
         which: (n,) ray of each point.
         model: an unconditional generator.
         seed: of its noise.
-        start: see ``inpaint``; None = its default.
 
     Raises:
         ConfigError: on a conditional model.
         DataError: on a scan of another sensor than the model's.
     """
-    from lidar_synth.generate.inpaint import START, check_model, inpaint
+    from lidar_synth.generate.inpaint import check_model, inpaint
 
     check_model(model, kept.sensor)
     there = np.linalg.norm(filled.points, axis=1) > 0
@@ -89,9 +87,7 @@ def redraw_hole(
     hole = np.zeros(distance.shape, bool)
     hole.reshape(-1)[cell[cell >= 0]] = True
     hole &= ~known | (everything.point >= len(kept))
-    [drawn] = inpaint(
-        model, [image], [hole], seed, [0], START if start is None else start
-    )
+    [drawn] = inpaint(model, [image], [hole], seed, [0])
     inside = (cell >= 0) & hole.reshape(-1)[np.maximum(cell, 0)]
     return _on_rays(filled, rays, which, drawn, cell, inside)
 

@@ -162,7 +162,6 @@ def remove_returns(
     parts: Sequence[tuple[NDArray[np.bool_], NDArray[np.float32]]],
     model: Model,
     seed: int,
-    start: float | None = None,
 ) -> Scan:
     """Remove returns from a scan and fill the hole.
 
@@ -171,7 +170,6 @@ def remove_returns(
         parts: for each object, (N,) True for its returns, and its box (7,).
         model: draws the hole; None for the estimate from its surroundings alone.
         seed: of the model's noise.
-        start: see ``inpaint``; None = its default.
 
     Returns:
         The scan with its remaining points unchanged and in order. Points of the hole take the place
@@ -202,7 +200,7 @@ def remove_returns(
     which = np.flatnonzero(hole & (donor >= 0))
     filled = _copies(scan, rays, which, donor[which], rho[which])
     if model is not None:
-        filled = redraw_hole(scan[~removed], filled, rays, which, model, seed, start)
+        filled = redraw_hole(scan[~removed], filled, rays, which, model, seed)
     seen = np.linalg.norm(filled.points, axis=1) > 0
     return replace_returns(scan, removed, rays, which[seen], filled[seen])
 

@@ -6,7 +6,6 @@ counted, and removed with their holes filled.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numba
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import BOXED, GROUND, NAMES
-from lidar_synth.errors import DataError, choose
+from lidar_synth.errors import DataError
 from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.labels.boxes import grow_box
 from lidar_synth.labels.edit.redraw import Model
@@ -170,23 +169,6 @@ HANDLING: dict[str, Callable[[Scan], Scan]] = {
     "error": Refusal(),
 }
 """What is done to unboxed objects of scans with boxes, by name."""
-
-
-def make_handling(name: str, model: Model = None) -> Callable[[Scan], Scan]:
-    """The handling of unboxed objects by its name: ``"close"`` removes them, ``"keep"`` does
-    nothing, ``"error"`` refuses the scan.
-
-    Args:
-        name: a key of ``HANDLING``.
-        model: for ``"close"``, see ``remove_unboxed``.
-
-    Raises:
-        ConfigError: on another name.
-    """
-    choose("unboxed", name, HANDLING)
-    if name == "close" and model is not None:
-        return partial(remove_unboxed, model=model)
-    return HANDLING[name]
 
 
 def _outside(scan: Scan, classes: Iterable[int]) -> NDArray[np.bool_]:

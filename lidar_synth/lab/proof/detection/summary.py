@@ -143,18 +143,14 @@ def _mean(groups: Groups) -> float | None:
     return round(float(np.mean(values)), 1) if values else None
 
 
-def interval_of(
-    own: Groups,
-    base: Groups,
-    draws: int = DRAWS,
-) -> tuple[float, float]:
+def interval_of(own: Groups, base: Groups) -> tuple[float, float]:
     """95 % interval of the mean difference of two arms, percentage points, by a bootstrap over the
     tested places of each seed.
 
     The average precision is of all drawn places together.
     """
     rng = np.random.default_rng(0)
-    values = [_draw(own, base, rng) for _ in range(draws)]
+    values = [_draw(own, base, rng) for _ in range(DRAWS)]
     low, high = np.nanquantile(values, (0.025, 0.975))
     return round(float(low), 1), round(float(high), 1)
 
