@@ -285,11 +285,7 @@ class Scan:
             and keep.shape == (len(self),)
         ):
             keep = np.flatnonzero(keep)  # several times as fast as masks for points
-        picked = {
-            n: getattr(self, n)[keep]
-            for n in POINT_FIELDS
-            if getattr(self, n) is not None
-        }
+        picked = {name: values[keep] for name, values in self.fields().items()}
         points = (
             self.points.take(keep, 0)
             if isinstance(keep, np.ndarray)

@@ -163,17 +163,11 @@ def measure_tables(tables: Sequence[Table], ignored: Sequence[int]) -> Meaning:
         for table in thin
         if spatial
     ]
-    distance = (
-        np.linalg.norm(columns[:, :3], axis=1)
-        if spatial
-        else np.full(len(columns), np.nan)
-    )
     ground = _median(grounds)
-    height = (
-        columns[:, 2] - (0 if np.isnan(ground) else ground)
-        if spatial
-        else np.full(len(columns), np.nan)
-    )
+    distance = height = np.full(len(columns), np.nan)
+    if spatial:
+        distance = np.linalg.norm(columns[:, :3], axis=1)
+        height = columns[:, 2] - np.nan_to_num(ground)
     return Meaning(
         points=float(np.median([len(table.columns) for table in tables])),
         quantiles=np.quantile(columns, QUANTILES, axis=0).T,
