@@ -30,6 +30,8 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import numbers, reading, write_file
 from lidar_synth.geometry import FARTHEST, Boxes
 
+Floats = NDArray[np.float64]
+
 MARGIN = 100
 """Maximum distance in frames (about 80 m) from an object's window at which the object is listed."""
 
@@ -98,15 +100,13 @@ class WorldBoxes:
             listed, whatever their class.
     """
 
-    transforms: NDArray[np.float64]
+    transforms: Floats
     names: NDArray[np.str_]
     instances: NDArray[np.int32]
     windows: NDArray[np.int64]
     annotated: NDArray[np.int64]
 
-    def at(
-        self, frame: int, pose: NDArray[np.float64], range_max: float
-    ) -> Boxes | None:
+    def at(self, frame: int, pose: Floats, range_max: float) -> Boxes | None:
         """The boxes around one scan, in its sensor frame; None if no window covers the frame.
 
         Args:
@@ -194,13 +194,11 @@ def read_boxes(path: Path) -> WorldBoxes:
     return found
 
 
-def _matrix(
-    node: ElementTree.Element, tag: str, shape: tuple[int, ...]
-) -> NDArray[np.float64]:
+def _matrix(node: ElementTree.Element, tag: str, shape: tuple[int, ...]) -> Floats:
     return np.array(node.findtext(f"{tag}/data", "").split(), np.float64).reshape(shape)
 
 
-def _unit_cube(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit_cube(vertices: Floats) -> Floats:
     """(4, 4) transform from the unit cube around the origin to the box of the vertices, usually the
     identity."""
     low = vertices.min(axis=0)
@@ -210,9 +208,7 @@ def _unit_cube(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix
 
 
-def write_boxes(
-    path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64]]]
-) -> None:
+def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, Floats]]) -> None:
     """Write the boxes of frames, or add them to those of other frames in an existing file.
 
     Args:
@@ -265,9 +261,7 @@ def _read_others(path: Path, frames: Container[int]) -> ElementTree.Element:
     return root
 
 
-def _objects(
-    frame: int, boxes: Boxes, pose: NDArray[np.float64]
-) -> list[ElementTree.Element]:
+def _objects(frame: int, boxes: Boxes, pose: Floats) -> list[ElementTree.Element]:
     nodes = []
     # Numbers for unknown instances: no other box of the frame has them, whatever its class.
     numbered = boxes.instance % MAX_INSTANCES

@@ -32,6 +32,8 @@ from lidar_synth.formats.calibration import (
     read_image_size,
 )
 
+Floats = NDArray[np.float64]
+
 CAMERA = ideal_camera(552.554261, (1408, 376))
 """The camera that is written if none is known: image_00's size and focal length, at the sensor."""
 
@@ -123,7 +125,7 @@ def write_calibration(root: Path, camera: Calibration) -> None:
     write_named_matrices(folder / "perspective.txt", matrices)
 
 
-def imu_from_sensor(camera: Calibration | None) -> NDArray[np.float64]:
+def imu_from_sensor(camera: Calibration | None) -> Floats:
     """(4, 4) from the velodyne to the IMU, whose poses ``poses.txt`` holds."""
     if camera is None or not {"image_00", "cam_to_velo"} <= set(camera.matrices):
         return IMU_FROM_SENSOR
@@ -131,9 +133,7 @@ def imu_from_sensor(camera: Calibration | None) -> NDArray[np.float64]:
     return homogeneous(camera.matrices["image_00"]) @ np.linalg.inv(cam_to_velo)
 
 
-def read_poses(
-    root: Path, drive: str, camera: Calibration | None
-) -> dict[int, NDArray[np.float64]]:
+def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, Floats]:
     """{frame: (4, 4) velodyne to world}; empty without ``poses.txt`` or calibration. Not every
     frame has a pose.
 
@@ -162,7 +162,7 @@ def read_poses(
     )
 
 
-def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -> None:
+def write_poses(root: Path, drive: str, poses: dict[int, Floats]) -> None:
     """The inverse of ``read_poses``, with the calibration in ``root``; poses of other frames in the
     files stay.
 
@@ -197,9 +197,7 @@ def _add_lines(path: Path, lines: dict[int, str]) -> None:
     write_file(path, "".join(text).encode())
 
 
-def fill_poses(
-    poses: dict[int, NDArray[np.float64]], frames: Iterable[int]
-) -> dict[int, NDArray[np.float64]]:
+def fill_poses(poses: dict[int, Floats], frames: Iterable[int]) -> dict[int, Floats]:
     """Poses of further frames, between two known poses that are at most ``STILL`` apart.
 
     The dataset leaves out frames in which the car hardly moved.

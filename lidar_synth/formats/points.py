@@ -17,6 +17,8 @@ from lidar_synth.files.disk import SKIP_HINT, reading, refuse_special, write_fil
 from lidar_synth.formats.calibration import check_rigid
 from lidar_synth.geometry import FARTHEST, Scan
 
+Floats = NDArray[np.float32]
+
 LONGEST = 60.0
 """Maximum time of a point from the moment of its scan's pose, seconds."""
 
@@ -32,7 +34,7 @@ _bad_points_kept = ContextVar("bad points kept", default=False)
 
 def read_points(
     path: Path, fields: int = 4, reflectance_max: float | None = None
-) -> NDArray[np.float32]:
+) -> Floats:
     """Read the points of a raw ``.bin`` file: little-endian float32, ``fields`` per point, no
     header.
 
@@ -100,8 +102,8 @@ def write_points(path: Path, scan: Scan) -> None:
 
 
 def check_points(
-    points: NDArray[np.float32],
-    reflectance: NDArray[np.float32],
+    points: Floats,
+    reflectance: Floats,
     where: str,
     reflectance_max: float = 1.0,
 ) -> None:
@@ -143,9 +145,7 @@ def check_points(
         )
 
 
-def finite(
-    points: NDArray[np.float32], reflectance: NDArray[np.float32]
-) -> NDArray[np.bool_]:
+def finite(points: Floats, reflectance: Floats) -> NDArray[np.bool_]:
     """(N,) True for points whose coordinates and reflectance are finite."""
     good: NDArray[np.bool_] = np.isfinite(points).all(axis=1) & np.isfinite(reflectance)
     return good
@@ -218,9 +218,7 @@ def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
         check_rigid(scan.pose, f"{where}: its pose")
 
 
-def _find_bad_value(
-    points: NDArray[np.float32], reflectance: NDArray[np.float32], where: str
-) -> None:
+def _find_bad_value(points: Floats, reflectance: Floats, where: str) -> None:
     bad = np.flatnonzero(~finite(points, reflectance))
     if len(bad):
         raise DataError(

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
 
+Floats = NDArray[np.float64]
+
 NEAR = 5.0
 FAR = 15.0
 """Metres beyond which points are compared with the field of view, and with single beams."""
@@ -152,9 +154,9 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
 
 
 def _compare(
-    points: NDArray[np.float64],
-    beams: NDArray[np.float64],
-    heights: NDArray[np.float64],
+    points: Floats,
+    beams: Floats,
+    heights: Floats,
     exact: bool,
 ) -> tuple[float, float, float, float, float]:
     """``above``, ``below``, ``gaps``, ``unused`` and ``between`` for beams at these elevations,
@@ -184,9 +186,9 @@ def _compare(
 
 
 def _between(
-    elevation: NDArray[np.float64],
+    elevation: Floats,
     sector: NDArray[np.intp],
-    beams: NDArray[np.float64],
+    beams: Floats,
     exact: bool,
 ) -> float:
     """Share of points between the beams, with the tilt of each sector that leaves the fewest

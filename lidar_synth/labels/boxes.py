@@ -9,18 +9,16 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry import Boxes, wrap_angle
 
+Floats = NDArray[np.float32]
 
-def box_frame(
-    points: NDArray[np.float32], box: NDArray[np.float32]
-) -> NDArray[np.float32]:
+
+def box_frame(points: Floats, box: Floats) -> Floats:
     """Transform points into the frame of one box (7,): (N, 3) metres along, across and above its
     centre."""
     return turn_points(points - box[:3], -box[6])
 
 
-def grow_box(
-    box: NDArray[np.float32], points: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def grow_box(box: Floats, points: Floats) -> Floats:
     """Enlarge a box (7,) about its centre so that it contains points (N, 3).
 
     A margin of one millimetre ensures that it still contains them when both are moved in float32.
@@ -31,7 +29,7 @@ def grow_box(
     )
 
 
-def move_boxes(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
+def move_boxes(boxes: Boxes, values: Floats) -> Boxes:
     """The boxes with new values (M, 7): without their boxes in the camera image, and with yaw in
     [-pi, pi)."""
     values = values.astype(np.float32)
@@ -73,7 +71,7 @@ def join_boxes(several: Sequence[Boxes]) -> Boxes:
     return Boxes(names=names, **arrays)
 
 
-def widen_boxes(values: NDArray[np.float32], margin: float) -> NDArray[np.float32]:
+def widen_boxes(values: Floats, margin: float) -> Floats:
     """Boxes (..., 7) with a margin in metres on each of their four sides."""
     return values + np.array([0, 0, 0, 2 * margin, 2 * margin, 0, 0], np.float32)
 

@@ -12,6 +12,8 @@ from lidar_synth.geometry.projection import locate
 from lidar_synth.labels.ground import FLOOR
 from lidar_synth.labels.objects import Object
 
+Floats = NDArray[np.float32]
+
 
 @dataclass
 class VisibleReturns:
@@ -25,7 +27,7 @@ class VisibleReturns:
     """
 
     cell: NDArray[np.int32]
-    range: NDArray[np.float32]
+    range: Floats
     seen: NDArray[np.bool_]
     total: int
 
@@ -94,7 +96,7 @@ class Composition:
         self,
         row: NDArray[np.intp],
         column: NDArray[np.intp],
-        depth: NDArray[np.float32],
+        depth: Floats,
         top: np.float32,
     ) -> None:
         nearer = depth < self._front[row, column]
@@ -119,7 +121,7 @@ def refuse_coarser(given: Sensor, wanted: Sensor) -> None:
         )
 
 
-def _close_gaps(front: NDArray[np.float32], height: NDArray[np.float32]) -> None:
+def _close_gaps(front: Floats, height: Floats) -> None:
     """Fill each empty cell (inf) between two returns, vertically or horizontally, with the farther
     one."""
     for axis in (0, 1):
@@ -140,9 +142,9 @@ def _close_gaps(front: NDArray[np.float32], height: NDArray[np.float32]) -> None
 def _outline(
     row: NDArray[np.intp],
     column: NDArray[np.intp],
-    depth: NDArray[np.float32],
+    depth: Floats,
     columns: int,
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
     """The cells of an object's outline: between its upper and lower returns, in all columns from
     its first to its last.
 

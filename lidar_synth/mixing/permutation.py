@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.noise import key_words
 
+Words = NDArray[np.uint64]
+
 TOGETHER = 4
 """Number of blocks that ``permute_blocks`` goes through at a time."""
 
@@ -91,11 +93,11 @@ def permute_blocks(
 
 
 def _once(
-    cells: NDArray[np.uint64],
+    cells: Words,
     size: int,
-    keys: NDArray[np.uint64],
-    order: NDArray[np.uint64],
-) -> NDArray[np.uint64]:
+    keys: Words,
+    order: Words,
+) -> Words:
     """One pass through all rounds of the network, over a grid of at least ``size`` cells."""
     rows = isqrt(size - 1) + 1
     columns = -(-size // rows)
@@ -109,27 +111,25 @@ def _once(
     return row * np.uint64(columns) + column
 
 
-def _shifted(
-    places: NDArray[np.uint64], size: int, keyed: NDArray[np.uint64]
-) -> NDArray[np.uint64]:
+def _shifted(places: Words, size: int, keyed: Words) -> Words:
     """Each place, 0 .. size - 1 with size < 2^32, shifted cyclically by a hash of its keyed
     value."""
-    moved: NDArray[np.uint64] = places + (
+    moved: Words = places + (
         (_mixed(keyed) >> np.uint64(32)) * np.uint64(size) >> np.uint64(32)
     )
     return moved - (moved >= size) * np.uint64(size)
 
 
-def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def _mixed(values: Words) -> Words:
     """SplitMix64's finaliser: flipping one input bit flips about half of the output bits. Products
     wrap."""
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    mixed: NDArray[np.uint64] = values ^ (values >> np.uint64(31))
+    mixed: Words = values ^ (values >> np.uint64(31))
     return mixed
 
 
 @lru_cache(256)
-def _keys(seed: int, stream: int) -> NDArray[np.uint64]:
+def _keys(seed: int, stream: int) -> Words:
     """One key for each round, and one for the permutation's number."""
     return key_words(seed, stream, _ROUNDS + 1)

@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.mixing.schedules import Schedule, settled, share_of
 
+Integers = NDArray[np.int64]
+
 EpochSize = Literal["add", "replace"] | int
 """The length of all epochs: ``"add"`` uses every real scan once and adds synthetic ones to reach
 the ratio, or the largest ratio of a schedule (where the ratio is smaller, real scans are used more
@@ -264,7 +266,7 @@ class _Node:
     right: "_Node | int"
 
 
-Number = TypeVar("Number", int, NDArray[np.int64])
+Number = TypeVar("Number", int, Integers)
 
 
 def split(weights: Sequence[Fraction], total: int) -> tuple[int, ...]:
@@ -289,9 +291,7 @@ def split(weights: Sequence[Fraction], total: int) -> tuple[int, ...]:
     return tuple(counts)
 
 
-def deal(
-    weights: Sequence[Fraction], samples: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def deal(weights: Sequence[Fraction], samples: Integers) -> tuple[Integers, Integers]:
     """The source of each sample, and its number within that source; consistent with ``split``.
 
     Args:
@@ -304,9 +304,7 @@ def deal(
     sources = np.empty_like(samples)
     numbers = np.empty_like(samples)
 
-    def walk(
-        node: _Node | int, where: NDArray[np.intp], number: NDArray[np.int64]
-    ) -> None:
+    def walk(node: _Node | int, where: NDArray[np.intp], number: Integers) -> None:
         if isinstance(node, int):
             sources[where] = node
             numbers[where] = number

@@ -17,6 +17,8 @@ from lidar_synth.geometry.layout.layout import (
 from lidar_synth.geometry.overlap import overlapping_pairs
 from lidar_synth.geometry.scan import Boxes, Scan
 
+Floats = NDArray[np.float32]
+
 KINDS = {
     "building": ("building",),
     "vegetation": ("vegetation", "trunk"),
@@ -95,7 +97,7 @@ def select_known_boxes(scan: Scan) -> Boxes:
     return boxes[[i for i in range(len(boxes)) if i not in later]] if later else boxes
 
 
-def _plane(points: NDArray[np.float32], name: str) -> tuple[float, float, float]:
+def _plane(points: Floats, name: str) -> tuple[float, float, float]:
     """The plane z = a + b x + c y through ground returns near the sensor, by repeated least
     squares."""
     near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR].astype(np.float64)
@@ -117,7 +119,7 @@ def _plane(points: NDArray[np.float32], name: str) -> tuple[float, float, float]
     return float(plane[0]), float(plane[1]), float(plane[2])
 
 
-def _lowest(points: NDArray[np.float32]) -> NDArray[np.float32]:
+def _lowest(points: Floats) -> Floats:
     """The lowest return of each column of 1 m x 1 m, where it lies below the sensor."""
     below = points[points[:, 2] < -0.5]
     cell = np.floor(below[:, :2] / _CUBE).astype(np.int64) @ (1 << 20, 1)
@@ -126,9 +128,7 @@ def _lowest(points: NDArray[np.float32]) -> NDArray[np.float32]:
     return below[order[first]]
 
 
-def _labelled(
-    points: NDArray[np.float32], label: NDArray[np.uint8]
-) -> Iterator[Outline]:
+def _labelled(points: Floats, label: NDArray[np.uint8]) -> Iterator[Outline]:
     for kind, classes in KINDS.items():
         for profile in _profiles(
             points[np.isin(label, [TRAIN_ID[name] for name in classes])]
@@ -150,7 +150,7 @@ def _unlabelled(scan: Scan, ground: tuple[float, float, float]) -> Iterator[Outl
         yield Outline(kind, profile[:, :2], profile[:, 2], profile[:, 3])
 
 
-def _profiles(points: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
+def _profiles(points: Floats) -> Iterator[Floats]:
     """The first thing in each sector, connected to lines: (K, 5) x, y, lowest z, highest z, depth
     of its returns."""
     rho = np.hypot(points[:, 0], points[:, 1])
@@ -179,7 +179,7 @@ def _profiles(points: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
     yield from _connected(np.array(rows, np.float64).reshape(-1, 5))
 
 
-def _find_run(rho: NDArray[np.float32]) -> tuple[int, int]:
+def _find_run(rho: Floats) -> tuple[int, int]:
     """The first run of ascending distances without a gap that has enough of them; (0, 0) without
     one."""
     ends = np.append(np.flatnonzero(np.diff(rho) > _GAP) + 1, len(rho))
@@ -200,7 +200,7 @@ def _groups(sector: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
     )
 
 
-def _connected(rows: NDArray[np.float64]) -> Iterator[NDArray[np.float32]]:
+def _connected(rows: NDArray[np.float64]) -> Iterator[Floats]:
     """Lines of neighbouring sectors with similar distance and edges; a sector alone is a line
     across it."""
     if not len(rows):
@@ -217,7 +217,7 @@ def _connected(rows: NDArray[np.float64]) -> Iterator[NDArray[np.float32]]:
         yield _trace(line)
 
 
-def _trace(line: NDArray[np.float64]) -> NDArray[np.float32]:
+def _trace(line: NDArray[np.float64]) -> Floats:
     # Half a sector on both sides, so that lines of neighbouring sectors meet.
     edges = np.r_[line[0, 0], line[:, 0] + 0.5, line[-1, 0] + 1]
     padded = np.r_[line[:1], line, line[-1:]]

@@ -33,6 +33,8 @@ from lidar_synth.geometry.scan import (
 )
 from lidar_synth.geometry.sensor import Rays, Sensor
 
+Floats = NDArray[np.float32]
+
 
 class Cells(NamedTuple):
     """The cell of each point, and the point that each cell shows.
@@ -44,11 +46,11 @@ class Cells(NamedTuple):
     """
 
     cell: NDArray[np.int32]
-    range: NDArray[np.float32]
+    range: Floats
     point: NDArray[np.int32]
 
 
-def locate(points: NDArray[np.float32], sensor: Sensor) -> Cells:
+def locate(points: Floats, sensor: Sensor) -> Cells:
     """Find the cell of each point on a sensor's grid, and the point that each cell shows.
 
     Args:
@@ -73,9 +75,7 @@ def locate(points: NDArray[np.float32], sensor: Sensor) -> Cells:
     return Cells(cell, distance, nearest_in(cell, distance, sensor)[1])
 
 
-def cells_of(
-    points: NDArray[np.float32], grid: Grid
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def cells_of(points: Floats, grid: Grid) -> tuple[NDArray[np.int32], Floats]:
     """Cell (N,) and range (N,) of each point; see ``locate``."""
     points = _checked(points)
     cell = np.empty(len(points), np.int32)
@@ -85,8 +85,8 @@ def cells_of(
 
 
 def nearest_in(
-    cell: NDArray[np.int32], distance: NDArray[np.float32], sensor: Sensor
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    cell: NDArray[np.int32], distance: Floats, sensor: Sensor
+) -> tuple[Floats, NDArray[np.int32]]:
     """Range (H, W) and index (H, W) of the nearest point in each cell; of points at equal range,
     the first.
 
@@ -219,7 +219,7 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
     return Scan(points[:count], sensor=image.sensor, boxes=image.boxes, **fields)
 
 
-def _checked(points: NDArray[Any]) -> NDArray[np.float32]:
+def _checked(points: NDArray[Any]) -> Floats:
     if points.dtype != np.float32 or points.ndim != 2 or points.shape[1] < 3:
         raise DataError(
             f"points of shape {points.shape}, {points.dtype}",

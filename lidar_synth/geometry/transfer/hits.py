@@ -12,6 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+
 _inlined = numba.njit(cache=True, nogil=True, inline="always")
 
 NEAREST = 0.6
@@ -33,9 +35,9 @@ class Vertices(NamedTuple):
         value: (N,) is interpolated between them.
     """
 
-    points: NDArray[np.float64]
-    azimuth: NDArray[np.float64]
-    rho: NDArray[np.float64]
+    points: Floats
+    azimuth: Floats
+    rho: Floats
     rows: NDArray[np.int32]
     value: NDArray[np.float32]
 
@@ -54,8 +56,8 @@ class FootprintShape(NamedTuple):
     recorded: NDArray[np.float32]
     level: NDArray[np.bool_]
     half: float
-    up: NDArray[np.float64]
-    down: NDArray[np.float64]
+    up: Floats
+    down: Floats
 
 
 class Nearest(NamedTuple):
@@ -68,7 +70,7 @@ class Nearest(NamedTuple):
         facing: (H, F) cosine of the angle between the ray and the normal.
     """
 
-    rho: NDArray[np.float64]
+    rho: Floats
     vertex: NDArray[np.int32]
     value: NDArray[np.float32]
     facing: NDArray[np.float32]

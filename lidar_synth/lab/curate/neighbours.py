@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from lidar_synth.noise import keyed_rng
 
+Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 DIMENSIONS = 64
@@ -71,7 +72,7 @@ class Signatures(Protocol):
 
 def find_similar(
     signatures: Signatures, progress: bool = True
-) -> tuple[NDArray[np.float64], Integers]:
+) -> tuple[Floats, Integers]:
     """For each signature, approximately the most similar earlier one; like ``most_similar``.
 
     Returns:
@@ -192,7 +193,7 @@ def _compare(
     sketches: NDArray[np.int8],
     queries: Integers,
     members: Integers,
-    best: NDArray[np.float64],
+    best: Floats,
 ) -> None:
     """Update the best candidates of each query with the earlier members of a cell."""
     keys = _keys(sketches[queries], sketches[members], members)
@@ -204,7 +205,7 @@ def _compare(
 
 def _keys(
     some: NDArray[np.int8], others: NDArray[np.int8], numbers: Integers
-) -> NDArray[np.float64]:
+) -> Floats:
     """(M, N) sort keys: the squared distance of two sketches first, then the number of the second
     sketch."""
     a = some.astype(np.float32)
@@ -212,13 +213,13 @@ def _keys(
     own = (a * a).sum(1)
     theirs = (b * b).sum(1)
     distances = own[:, None] + theirs - 2 * (a @ b.T)  # whole numbers below 2^22
-    keys: NDArray[np.float64] = distances.astype(np.float64) * _NUMBERS + numbers
+    keys: Floats = distances.astype(np.float64) * _NUMBERS + numbers
     return keys
 
 
 def _best(
     signatures: Signatures, part: slice, found: Integers
-) -> tuple[NDArray[np.float64], Integers]:
+) -> tuple[Floats, Integers]:
     """Similarity and number of the most similar of the candidates (M, K) of each signature; the
     first one of equals."""
     found = np.sort(found, 1)

@@ -29,6 +29,8 @@ from lidar_synth.lab.curate.features import MEASURES, RANGE_BINS, features
 from lidar_synth.lab.curate.store import Store, measure
 from lidar_synth.lab.evaluate import jensen_shannon_distance
 
+Floats = NDArray[np.float64]
+
 FILE = "scores.npz"
 """Name of the file, in the bank's folder."""
 
@@ -63,7 +65,7 @@ class Scores:
 
     bank: str
     reference: str
-    values: dict[str, NDArray[np.float64]]
+    values: dict[str, Floats]
     twin: NDArray[np.int64]
 
 
@@ -168,7 +170,7 @@ class _Mean:
             self._count += 1
 
     @property
-    def value(self) -> NDArray[np.float64]:
+    def value(self) -> Floats:
         return self._total / max(self._count, 1)
 
 
@@ -202,9 +204,7 @@ def _of_source(source: Source, sensor: Sensor, number: int) -> Histograms:
     return found.ranges, found.classes
 
 
-def _distances(
-    store: Store, key: str, mean: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _distances(store: Store, key: str, mean: Floats) -> Floats:
     """(N,) Jensen-Shannon distance of each scan's histogram to a mean histogram."""
     known = mean.any()
     found = (

@@ -27,6 +27,8 @@ from lidar_synth.lab.train.segmentation import endless_batches, train_segmenter
 from lidar_synth.labels.augment import mirror_scan, rotate_scan
 from lidar_synth.mixing import MixedScans, settle
 
+Integers = NDArray[np.int64]
+
 LOOKS = 8
 """Points of the curve of a training."""
 SETTLING = 16
@@ -133,13 +135,13 @@ class TrialOutcome:
         seconds: that the training took.
     """
 
-    table: NDArray[np.int64]
-    curve: list[tuple[int, NDArray[np.int64]]] = field(default_factory=list)
+    table: Integers
+    curve: list[tuple[int, Integers]] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)
     seconds: float = 0.0
 
 
-Outcome = TrialOutcome | NDArray[np.int64]
+Outcome = TrialOutcome | Integers
 Trainer = Callable[[Job], Mapping[str, Outcome] | Outcome]
 """Trains as a job says and tests on its held-out scans; returns {place: outcome}, or an outcome if
 there is one place. An outcome is a ``TrialOutcome``, or its table alone."""
@@ -189,7 +191,7 @@ def _outcome_of(result: Outcome, seconds: float) -> TrialOutcome:
     return replace(outcome, seconds=seconds)
 
 
-Tables = dict[str, NDArray[np.int64]]
+Tables = dict[str, Integers]
 """{place: table}"""
 
 
@@ -262,7 +264,7 @@ def images(scans: Sequence[Scan], sensor: Sensor) -> list[Images]:
 
 def _test(
     network: nn.Module, held_out: Sequence[Images], height: Tensor, half: bool
-) -> NDArray[np.int64]:
+) -> Integers:
     network.eval()
     with torch.autocast(height.device.type, torch.bfloat16, enabled=half):
         return confusion(network, held_out, height)

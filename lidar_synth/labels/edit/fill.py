@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.labels.edit.rays import ScanRays
 
+Floats = NDArray[np.float64]
+
 _compiled = numba.njit(cache=True)
 
 SIDE = 32
@@ -46,11 +48,11 @@ _SMOOTH = 2  # rays to either side over which a distance is averaged
 def continue_surfaces(
     rays: ScanRays,
     hole: NDArray[np.bool_],
-    near: NDArray[np.float64],
-    far: NDArray[np.float64],
+    near: Floats,
+    far: Floats,
     ground: NDArray[np.bool_],
     thing: NDArray[np.bool_],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int64], Floats]:
     """Continue the surfaces beside a hole.
 
     Args:
@@ -95,9 +97,9 @@ class _Ring(NamedTuple):
     step: float
     hole: NDArray[np.bool_]
     known: NDArray[np.bool_]
-    rho: NDArray[np.float64]
-    near: NDArray[np.float64]
-    far: NDArray[np.float64]
+    rho: Floats
+    near: Floats
+    far: Floats
     ground: NDArray[np.bool_]
     thing: NDArray[np.bool_]
 

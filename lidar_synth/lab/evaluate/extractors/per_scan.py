@@ -11,6 +11,8 @@ from torch import Tensor
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Scan
 
+Floats = NDArray[np.float32]
+
 
 @dataclass(frozen=True)
 class PerScan:
@@ -22,9 +24,7 @@ class PerScan:
 
     describe: Callable[[Scan, bool], Tensor]
 
-    def __call__(
-        self, scans: Sequence[Scan], generated: bool = False
-    ) -> NDArray[np.float32]:
+    def __call__(self, scans: Sequence[Scan], generated: bool = False) -> Floats:
         """n scans to (n, D) features; see ``Extractor``.
 
         Raises:
@@ -36,9 +36,9 @@ class PerScan:
         with torch.inference_mode():
             return np.stack([self._row(scan, generated) for scan in scans])
 
-    def _row(self, scan: Scan, generated: bool) -> NDArray[np.float32]:
+    def _row(self, scan: Scan, generated: bool) -> Floats:
         try:
-            row: NDArray[np.float32] = self.describe(scan, generated).numpy()
+            row: Floats = self.describe(scan, generated).numpy()
         except DataError as error:
             raise DataError(f"scan {scan.id!r}: {error}") from error
         if not np.isfinite(row).all():
@@ -49,7 +49,7 @@ class PerScan:
         return row
 
 
-def some(points: NDArray[np.float32] | Tensor) -> int:
+def some(points: Floats | Tensor) -> int:
     """The number of returns; a protocol needs at least one.
 
     Raises:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from lidar_synth.lab.proof.detection.boxes import CLASSES
 
+Integers = NDArray[np.int64]
 Floats = NDArray[np.float32]
 
 REACH = 51.2
@@ -61,7 +62,7 @@ class Found:
 
     boxes: Floats
     scores: Floats
-    classes: NDArray[np.int64]
+    classes: Integers
 
 
 def view(
@@ -95,7 +96,7 @@ def _fill(image, count, points, reflectance):  # type: ignore[no-untyped-def]
 
 def targets(
     boxes: Floats,
-    classes: NDArray[np.int64],
+    classes: Integers,
     pixel: float,
 ) -> Target:
     """The targets of M boxes (M, 7) with classes (M,); pixels have sides of ``pixel`` metres."""
@@ -128,8 +129,8 @@ def targets(
 
 def _offsets(
     centre: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
+    rows: Integers,
+    columns: Integers,
 ) -> list[NDArray[np.float64]]:
     """From the middle of each pixel to a centre, in pixels: along the rows and along the
     columns."""

@@ -21,6 +21,8 @@ from lidar_synth.lab.proof.detection.boxes import (
     points_in,
 )
 
+Floats = NDArray[np.float32]
+
 OVERLAP = (0.5, 0.25, 0.25)
 """Minimum intersection over union of the footprints of cars, pedestrians and cyclists."""
 
@@ -30,7 +32,7 @@ class Truth:
     """The boxes of a tested scan: (M, 7), classes (M,), and whether each has to be found (M,). The
     others, with fewer than ``LEAST`` returns or outside the view, may be found."""
 
-    boxes: NDArray[np.float32]
+    boxes: Floats
     classes: NDArray[np.int64]
     wanted: NDArray[np.bool_]
 
@@ -61,8 +63,8 @@ class Criterion:
 
     def fit(
         self,
-        boxes: NDArray[np.float32],
-        truth: NDArray[np.float32],
+        boxes: Floats,
+        truth: Floats,
     ) -> NDArray[np.float64]:
         """(D, M) how well boxes (D, 7) fit others (M, 7); 1 and more is right."""
         if self.overlap:
@@ -70,7 +72,7 @@ class Criterion:
         apart = _distances(boxes, truth)
         return np.asarray(self.distance / np.maximum(apart, 1e-9), np.float64)
 
-    def includes(self, boxes: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def includes(self, boxes: Floats) -> NDArray[np.bool_]:
         """(M,) whether boxes (M, 7) are within the limits of distance."""
         away = np.hypot(*boxes[:, :2].T)
         return np.asarray((self.near <= away) & (away < self.far))
@@ -80,7 +82,7 @@ class Judged(NamedTuple):
     """The detections of a class that count, in some scans: (D,) scores and (D,) 1 for right ones;
     and the number of boxes that have to be found."""
 
-    scores: NDArray[np.float32]
+    scores: Floats
     hits: NDArray[np.int64]
     wanted: int
 
@@ -127,7 +129,7 @@ def precisions(
 
 def matched(
     fit: NDArray[np.float64],
-    scores: NDArray[np.float32],
+    scores: Floats,
     wanted: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
     """(D,) 1 for a right detection, 0 for a wrong one, -1 for one that does not count: of a box
@@ -150,15 +152,15 @@ def matched(
     return result
 
 
-def _distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+def _distances(a: Floats, b: Floats) -> NDArray[np.float64]:
     """(A, B) distances between the centres of boxes (A, 7) and (B, 7) on the ground."""
     x, y = (a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1)
     return np.asarray(np.hypot(x, y))
 
 
 def footprint_ious(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
+    a: Floats,
+    b: Floats,
 ) -> NDArray[np.float64]:
     """(A, B) intersection over union of the footprints of boxes (A, 7) and (B, 7)."""
     ious = np.zeros((len(a), len(b)))
