@@ -19,7 +19,7 @@ from lidar_synth.geometry import Scan
 
 
 @dataclass(frozen=True)
-class Samples:
+class ScansOfSeed:
     """The scans of a seed by number.
 
     Args:

@@ -86,7 +86,7 @@ def sample(
     """
     from lidar_synth.bake.conditions import conditions_for, settle_objects
     from lidar_synth.bake.job import DTYPES
-    from lidar_synth.bake.samples import Samples
+    from lidar_synth.bake.samples import ScansOfSeed
     from lidar_synth.errors import choose
     from lidar_synth.formats import WRITERS
     from lidar_synth.generate.flow.solvers import read_grid
@@ -97,7 +97,7 @@ def sample(
     generator = load_generator(
         model, device=device, dtype=precision, batch=batch, columns=columns
     )
-    samples = Samples(
+    scans = ScansOfSeed(
         generator,
         seed,
         conditions_for(generator, condition, condition_layout, condition_split),
@@ -117,5 +117,5 @@ def sample(
         "condition_split": condition_split,
         "columns": columns,
     }
-    written = samples.write(writer, count, asked)
+    written = scans.write(writer, count, asked)
     echo(f"{out}: {written} scans written, {count - written} were there already")
