@@ -153,6 +153,7 @@ def test_a_class_counts_in_the_seeds_and_comparisons_that_test_it() -> None:
     ("arm", "expected"),
     [
         ("first", [8] * 30 + [4] * 8 + [0] * 2),
+        ("layouts", [8] * 30 + [4] * 8 + [0] * 2),
         ("quarter", [8] * 10 + [0] * 30),
         ("town", [8] * 40),
         ("gt_sampling", [0] * 40),
@@ -253,6 +254,19 @@ def test_a_pool_and_a_comparison_are_of_one_sensor(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="was filled with"):
         _ = second.town
     assert study._identity(first) != study._identity(second)
+
+
+def test_scans_of_layouts_have_boxes_of_the_towns(tmp_path: Path) -> None:
+    settings = DetectionSettings(arms=("layouts",), synthetic=1)
+    work = DetectionWork([street(0)], settings, tmp_path / "out", tmp_path / "pool")
+    assert work.synthetic(ARMS["real"]) is None
+    town = work.synthetic(ARMS["first"])
+    drawn = work.synthetic(ARMS["layouts"])
+    assert town is not None and drawn is not None and len(drawn) == len(town) == 1
+    assert drawn[0].sensor == town[0].sensor
+    assert not np.array_equal(drawn[0].points, town[0].points)
+    names = [scan[0].boxes.names for scan in (drawn, town)]
+    assert names[0] and set(names[0]) <= set(names[1])
 
 
 class Drives:

@@ -11,7 +11,7 @@ _ARMS = (
     "a training to compare, repeatable: real | longer | exchange | town | skin | "
     "generator | pretrain | pretrain-skin | pretrain-generator | alone | "
     "pretrain-learnt | quarter | quarter-town | recipe [exchange, recipe, quarter]; "
-    "of detectors: real | gt_sampling | objects | half | first | quarter | town"
+    "of detectors: real | gt_sampling | objects | half | first | layouts | quarter | town"
 )
 
 

@@ -98,7 +98,7 @@ def make_generated(task: PoolTask) -> Iterator[Scan]:
     if generator.condition is not None:
         streets = town_scans(replace(task, sensor=generator.sensor), None)
     made = (generator.scans(0, [i], s)[0] for i, s in enumerate(streets))
-    yield from _as_sensor(made, task.sensor)
+    yield from as_sensor(made, task.sensor)
 
 
 def learnt_town(task: PoolTask) -> Iterator[Scan]:
@@ -119,12 +119,12 @@ def learnt_town(task: PoolTask) -> Iterator[Scan]:
     interval = data["interval"]
     motion = data["motion"]
     made = Town(data["seed"], generator.sensor, data["town"], interval, motion=motion)
-    yield from _as_sensor(
+    yield from as_sensor(
         (made[i] for i in spread(range(len(made)), task.count)), task.sensor
     )
 
 
-def _as_sensor(scans: Iterable[Scan], sensor: Sensor) -> Iterator[Scan]:
+def as_sensor(scans: Iterable[Scan], sensor: Sensor) -> Iterator[Scan]:
     """The scans as a sensor would measure them; reflectance is matched in each training, to its
     labelled scans."""
     unchanged = Response((0.0, 1.0), (0.0, 1.0))

@@ -31,14 +31,16 @@ class DetectionArm:
         title: its row in tables.
         pasted: the objects that are pasted into all scans: those of the labelled scans
             (``OWN``), of the town (``TOWN``), or both.
-        ratio: share of scans of the town, as ``mix`` takes it.
+        ratio: share of synthetic scans, as ``mix`` takes it.
         budget: what it uses besides the labelled scans.
+        generated: whether a model draws them, from the layouts of the town's scans.
     """
 
     title: str
     pasted: tuple[str, ...] = ()
     ratio: Ratio = 0.0
     budget: str = "none"
+    generated: bool = False
 
 
 _TOWN = f"boxes of the town; {CALIBRATED_ON}"
@@ -62,6 +64,13 @@ ARMS = {
         SyntheticFirst(EPOCHS),
         _TOWN,
     ),
+    "layouts": DetectionArm(
+        "scans of layouts first, then half, real scans last, GT sampling",
+        (OWN,),
+        SyntheticFirst(EPOCHS),
+        f"{_TOWN}; labels of the town's scans that the model learnt from",
+        generated=True,
+    ),
     "quarter": DetectionArm(
         "the town for a quarter, then real scans alone, GT sampling",
         (OWN,),
@@ -76,7 +85,7 @@ ARMS = {
 def make_mixture(
     arm: DetectionArm,
     labelled: Sequence[Scan],
-    town: Source | None,
+    synthetic: Source | None,
     objects: ObjectBank | None,
     seed: int,
     epoch_size: int,
@@ -86,7 +95,7 @@ def make_mixture(
     Args:
         arm: the arm.
         labelled: real scans with boxes.
-        town: scans of the town.
+        synthetic: scans of the town, or generated ones.
         objects: those of the town.
         seed: of the mixture.
         epoch_size: number of samples of each of ``EPOCHS`` epochs.
@@ -95,7 +104,7 @@ def make_mixture(
     pasted = [bank for name in arm.pasted if (bank := banks[name]) is not None]
     return MixedScans(
         None if arm.ratio == 1 else labelled,
-        town if arm.ratio != 0 else None,
+        synthetic,
         arm.ratio,
         "boxes",
         seed=seed,

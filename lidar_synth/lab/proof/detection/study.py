@@ -20,7 +20,6 @@ from lidar_synth.files.disk import hash_of_names, write_file
 from lidar_synth.files.parsing import read_sealed, seal
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.camera_boxes import CameraBoxes
-from lidar_synth.formats.npz import write_scan
 from lidar_synth.generate.devices import check_device
 from lidar_synth.geometry import Source
 from lidar_synth.geometry.overlap import count_overlapping
@@ -29,25 +28,24 @@ from lidar_synth.lab.proof.detection.arms import (
     ARMS,
     BASE,
     OWN,
+    DetectionArm,
     make_mixture,
 )
 from lidar_synth.lab.proof.detection.bev import Found, view
-from lidar_synth.lab.proof.detection.boxes import detected, with_points
+from lidar_synth.lab.proof.detection.boxes import detected
 from lidar_synth.lab.proof.detection.network import (
     Detector,
     detect,
     train,
 )
 from lidar_synth.lab.proof.detection.page import body
+from lidar_synth.lab.proof.detection.pools import draw_layouts, make_town
 from lidar_synth.lab.proof.detection.scores import Truth
 from lidar_synth.lab.proof.detection.summary import summarise
 from lidar_synth.lab.proof.machine import command_line, machine
 from lidar_synth.lab.proof.page import write_body
 from lidar_synth.lab.proof.places import Places, choose, find_places, names_of
 from lidar_synth.lab.proof.plan import count_scans
-from lidar_synth.lab.proof.pools import SETTINGS, TOWN_SEED
-from lidar_synth.lab.town import STRETCH_FRAMES, Town
-from lidar_synth.lab.town.catalogue import TABLES_HASH
 from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels import ObjectBank
 
@@ -56,8 +54,6 @@ log = logging.getLogger(__name__)
 RATE = 3e-3
 MOST_OVERLAPPING = 0.1
 """Share of a scan's boxes that may overlap another of their class without a warning."""
-MOMENTS = (3, 10, 17)
-"""The scans of each stretch of the town in its pool."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +127,7 @@ class DetectionWork:
         source: real scans with boxes.
         settings: what is compared.
         out: the folder of results.
-        pool: the folder of the town's scans.
+        pool: the folder of the town's scans; those of their layouts are beside it.
         device: on which the detector computes.
     """
 
@@ -148,32 +144,19 @@ class DetectionWork:
 
     @cached_property
     def town(self) -> Source:
-        """Scans of the town by the sensor of the real scans, kept in ``pool``.
+        """Scans of the town by the sensor of the real scans; raises as ``make_town``."""
+        return make_town(self.pool, self.source[0].sensor, self.settings.synthetic)
 
-        Raises:
-            ConfigError: if the folder holds those of another sensor or version of the town.
-        """
-        sensor = self.source[0].sensor
-        identity = {"sensor": sensor.to_dict(), "tables": TABLES_HASH}
-        claim(self.pool / SETTINGS, identity)
-        count = self.settings.synthetic
-        stretches = -(-count // len(MOMENTS))
-        town = Town(
-            TOWN_SEED,
-            sensor,
-            stretches * STRETCH_FRAMES,
-            interval=2.0,
-            motion=False,
-        )
-        for number in tqdm(range(count), "scans of the town", disable=None):
-            path = self.pool / f"{number:06d}.npz"
-            stretch, moment = divmod(number, len(MOMENTS))
-            if not path.exists():
-                index = stretch * STRETCH_FRAMES + MOMENTS[moment]
-                write_scan(path, with_points(town[index]))
-        kept = open_scans(self.pool)
-        kept.ids = kept.ids[:count]  # other comparisons may have made more
-        return kept
+    @cached_property
+    def generated(self) -> Source:
+        """Scans of the layouts of the town's scans; raises as ``draw_layouts``."""
+        return draw_layouts(self.pool.with_name(f"{self.pool.name}_layouts"), self.town)
+
+    def synthetic(self, arm: DetectionArm) -> Source | None:
+        """The synthetic scans of an arm; None if it has none."""
+        if arm.ratio == 0:
+            return None
+        return self.generated if arm.generated else self.town
 
     @cached_property
     def objects(self) -> ObjectBank:
@@ -213,12 +196,11 @@ class DetectionWork:
         network = Detector().to(self.device)
         labelled = [self.source[i] for i in self.labelled(seed)]
         epoch_size = self.settings.batch * max(1, self.settings.iterations // EPOCHS)
-        town = self.town if arm.ratio != 0 else None
         objects = self.objects if set(arm.pasted) - {OWN} else None
         mixed = make_mixture(
             arm,
             labelled,
-            town,
+            self.synthetic(arm),
             objects,
             seed,
             epoch_size,
