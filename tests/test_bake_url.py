@@ -35,6 +35,7 @@ from lidar_synth.bank import INDEX, Bank
 from lidar_synth.bank.folder import RemoteFolder, open_folder
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import open_scans
+from lidar_synth.formats.models import models_of
 
 KILLS = 20
 
@@ -494,12 +495,20 @@ def test_a_url_is_no_folder_to_write_to(
     assert not list(Path().iterdir())
 
 
-def test_a_bank_at_a_url_is_converted_and_viewed(tmp_path: Path) -> None:
+def test_a_bank_at_a_url_is_converted_and_viewed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     url = empty_memory()
-    write_bank(tmp_path / "bank", [some_image(i) for i in range(4)])
+    images = [some_image(i) for i in range(4)]
+    write_bank(tmp_path / "bank", images, provenance={"data": ["mine"]})
     upload(tmp_path / "bank", url)
-    assert call("convert", url, tmp_path / "out", "--to", "npz")[0] == 0
+    for folder in (tmp_path, tmp_path / "out"):
+        monkeypatch.chdir(folder)
+        assert call("convert", url, tmp_path / "out", "--to", "npz")[0] == 0
+        monkeypatch.undo()
     assert len(open_scans(tmp_path / "out")) == 4
+    assert models_of(tmp_path / "out") == [{"data": ["mine"]}]
+    assert url in repr(open_scans(url))
     assert call("view", url, "--out", tmp_path / "one.html")[0] == 0
 
 

@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
@@ -412,6 +412,15 @@ def test_a_folder_filled_from_something_else_is_refused(tmp_path: Path) -> None:
     (out.root / SETTINGS).write_text("{")
     with pytest.raises(DataError, match="damaged"):
         convert(a, out, progress=False)
+
+
+def test_another_bank_in_the_place_of_the_first_one_is_refused(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        write_bank(tmp_path / "bank", [some_image(seed)])
+        refused = pytest.raises(ConfigError, match="was filled with {'options': {'bank")
+        with refused if seed else nullcontext():
+            out = WRITERS["npz"](tmp_path / "out")
+            convert(open_scans(tmp_path / "bank"), out, progress=False)
 
 
 def test_other_options_of_the_reader_do_not_keep_the_old_scans(tmp_path: Path) -> None:

@@ -140,11 +140,8 @@ def open_scans(
         >>> scan.points.shape == (len(scan), 3), scan.label.dtype
         (True, dtype('uint8'))
     """
-    if isinstance(path, str) and is_url(path):
-        layout = layout or "bank"
-    else:
-        path = Path(path)
-    name = layout_of(Path(path)) if layout is None else layout
+    path = path if is_url(path) else Path(path)
+    name = layout_of(path) if layout is None else layout
     reader = choose("layout", name, READERS)
     taken = inspect.signature(reader).parameters
     given: dict[str, Any] = {
@@ -169,13 +166,16 @@ def open_scans(
 _AS_FOLDER = "--layout folder (layout='folder') reads its files as plain ones."
 
 
-def layout_of(path: Path) -> str:
-    """Recognise the layout of the scans at a path.
+def layout_of(path: str | Path) -> str:
+    """Recognise the layout of the scans at a path; at a URL there are only banks.
 
     Raises:
         FileError: if the path does not exist.
         DataError: if no reader recognises it.
     """
+    if is_url(path):
+        return "bank"
+    path = Path(path)
     if not path.exists():
         raise FileError(
             f"{path} does not exist", "a dataset's root, a folder of scans, or one file"

@@ -1,6 +1,7 @@
 """Reader of banks ("lidar-synth-bank/1" and /2); ``lidar_synth.bank`` describes the format."""
 
 from pathlib import Path
+from typing import Any
 
 from lidar_synth.bank import Bank, is_bank
 from lidar_synth.errors import ConfigError
@@ -15,6 +16,9 @@ class BankScans(ScanFiles):
         root: the bank's folder, or its URL.
         sensor: the expected sensor; by default the bank's own.
         on_bad: see ``ScanFiles``.
+
+    Attributes:
+        root: the path of the bank's folder, or the text of its URL.
 
     Raises:
         FileError: if there is no bank, or a shard is missing.
@@ -41,9 +45,9 @@ class BankScans(ScanFiles):
                 f"sensor {sensor} for {root}",
                 f"{self.bank.sensor.name!r}, whose scans it holds",
             )
-        super().__init__(
-            Path(root), self.bank.ids, None, on_bad, stored=self.bank.sensor
-        )
+        place: Any = self.bank.root
+        super().__init__(place, self.bank.ids, None, on_bad, stored=self.bank.sensor)
+        self.options["bank"] = self.bank.identity
 
     def read(self, index: int) -> Scan:
         return self.bank[index]

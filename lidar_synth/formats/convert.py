@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
+from lidar_synth.bank import is_url
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.files.processes import map_in_processes
@@ -299,7 +300,7 @@ def _settings(
     }
     if isinstance(source, ScanFiles):
         settings |= {
-            "root": str(source.root.resolve()),
+            "root": str(source.root if is_url(source.root) else source.root.resolve()),
             "sensor": source.sensor.to_dict(),
         }
         settings["names"] = hash_of_names(source.ids)

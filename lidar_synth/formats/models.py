@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lidar_synth.bank import Bank, is_bank
+from lidar_synth.bank import Bank, is_bank, is_url
 from lidar_synth.datasets.recordings import MODELS, NOTE
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import write_file
@@ -15,19 +15,20 @@ Provenances = list[dict[str, Any]]
 """Of checkpoints; ``datasets.recordings.seen_by`` finds the training data in each."""
 
 
-def models_of(path: Path) -> Provenances:
+def models_of(path: str | Path) -> Provenances:
     """The provenances of the models that generated the scans at a path; empty if nothing beside the
     scans has them.
 
     Args:
-        path: a folder of ``lidar-synth sample``, a bank, or a folder into which such scans were
-            converted.
+        path: a folder of ``lidar-synth sample``, a bank or its URL, or a folder into which such
+            scans were converted.
 
     Raises:
         FileError, DataError: if what lies beside them is damaged.
     """
-    if is_bank(path):
+    if is_url(path) or is_bank(path):
         return [dict(facts.provenance) for facts in Bank(path).index.sources]
+    path = Path(path)
     found: Provenances = []
     if (path / NOTE).is_file():
         note = read_facts(path / NOTE, "the settings that lidar-synth sample wrote")

@@ -157,7 +157,7 @@ class Writer(ABC):
                 read, or if it is claimed for the first time and holds files like those of scans.
         """
         if isinstance(source, ScanFiles) and (
-            source.plain or self.root.resolve() == source.root.resolve()
+            source.plain or self.root.resolve() == Path(source.root).resolve()
         ):
             require_outside(self.root, source.root)
         path = self.root / note
