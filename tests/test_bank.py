@@ -302,6 +302,14 @@ def test_a_bank_can_be_opened_and_converted_like_any_source(
         assert np.array_equal(a.points, b.points) and np.array_equal(a.label, b.label)
 
 
+def test_a_bank_without_reflectance_warns(tmp_path: Path) -> None:
+    """Not: scans of constant reflectance, which a network would learn."""
+    write_bank(tmp_path, [some_image()], fields=("label",))
+    with pytest.warns(UserWarning, match="have no reflectance: it is read as 0"):
+        scans = open_scans(tmp_path)
+    assert not scans[0].reflectance.any()
+
+
 def test_a_paged_bank_reads_over_a_network(tmp_path: Path) -> None:
     import fsspec
 

@@ -1,6 +1,7 @@
 """A bank as a source of scans."""
 
 import os
+import warnings
 import weakref
 from bisect import bisect_right
 from collections import OrderedDict
@@ -48,6 +49,8 @@ class Bank:
         fields: the fields that a scan has besides its points.
         identity: the checksum of the index, different for every bank.
 
+    A bank without reflectance is opened with a warning.
+
     Raises:
         FileError: if there is no bank, a shard is missing, or a file cannot be read.
         DataError: on an index that is damaged or of another version, or a shard of another size.
@@ -78,6 +81,11 @@ class Bank:
         self._shards: OrderedDict[int, ShardReader] = OrderedDict()
         self._open: OrderedDict[int, ShardReader] = OrderedDict()
         self._process = os.getpid()
+        if "reflectance" not in self.fields:
+            warnings.warn(
+                f"the scans of {self.root} have no reflectance: it is read as 0",
+                stacklevel=1,  # once, however often it is opened
+            )
         self._cache = _open_cache(self.root, cache, limit, self.index)
         if self._cache is not None:
             self.expect = self._cache.expect  # a mixture announces what it reads next
