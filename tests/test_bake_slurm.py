@@ -80,12 +80,27 @@ def test_a_failed_job_is_reported(plan: BakePlan) -> None:
     (plan.out / SETTINGS).unlink()
     with pytest.raises(
         FileError,
-        match=r"(?s)Slurm job \d+.* failed .*has vanished or lost its .bake.json",
-    ):
+        match=r"Slurm job \d+.* failed .*has vanished or lost its .bake.json",
+    ) as failed:
         ENGINES["slurm"](plan, range(4), Resources(2, slurm=LOCAL), lambda scans: None)
+    assert "Traceback" not in str(failed.value)
     assert len(list((plan.out / LOGS).glob("*.out"))) == 2  # kept for diagnosis
     bake(plan, progress=False)
     assert not (plan.out / LOGS).exists()
+
+
+def test_what_slurm_says_about_a_wrong_option_is_reported(
+    plan: BakePlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("srun", "sbatch"):
+        (tmp_path / name).write_text("#!/bin/sh\necho invalid partition >&2; exit 1\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    given = {"slurm_partition": "none"}
+    with pytest.raises(
+        ConfigError, match=r"--slurm .*'none'.* \(invalid partition\); expected"
+    ):
+        bake(plan, "slurm", Resources(2, slurm=given), progress=False)
 
 
 def test_a_missing_slurm_and_unknown_options_are_refused(

@@ -7,6 +7,7 @@ time; it resumes after its last finished shard. The options are submitit's (``sl
 without Slurm.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from lidar_synth.bake.folder import LOGS
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
-from lidar_synth.errors import ConfigError, FileError, needs
+from lidar_synth.errors import ConfigError, FileError, LidarSynthError, needs
 
 # Submitit's default of 5 minutes may be too short for a shard.
 _OPTIONS = {"cluster": "slurm", "timeout_min": 240}
@@ -45,22 +46,21 @@ def bake_on_slurm(
 
     Raises:
         LibraryError: if submitit is not installed.
-        ConfigError: if Slurm is not available, or on an option that submitit does not have.
+        ConfigError: if Slurm is not available, or on an option that submitit does not have or Slurm
+            refuses.
         FileError: if a job failed; the others are cancelled.
     """
     with needs("slurm", "engine 'slurm', but submitit"):
         import submitit
-    workers = min(resources.workers, len(numbers))
-    executor = _executor(submitit, plan, resources.slurm)
-    jobs = executor.map_array(
-        SlurmTask(), [plan] * workers, [numbers[k::workers] for k in range(workers)]
-    )
+    jobs = _submit(submitit, plan, numbers, resources)
     try:
         for job in submitit.helpers.as_completed(jobs, poll_frequency=_POLL):
             progress(job.result())
     except submitit.core.utils.UncompletedJobError as error:
+        # the last error of the job's trace, if it is one of ours
+        named = re.findall(rf"^{LidarSynthError.__module__}\.\w+: .*", str(error), re.M)
         raise FileError(
-            f"Slurm job {job.job_id} failed ({error})",
+            f"Slurm job {job.job_id} failed ({(named or [error])[-1]})",
             f"jobs that finish; their logs are in {_logs(plan)}",
             "Run the same command again: finished shards are kept.",
         ) from error
@@ -70,26 +70,31 @@ def bake_on_slurm(
                 job.cancel()
 
 
-def _executor(submitit: Any, plan: BakePlan, options: dict[str, str | int]) -> Any:
-    """A submitit executor with the options of a job."""
+def _submit(
+    submitit: Any, plan: BakePlan, numbers: Sequence[int], resources: Resources
+) -> Any:
+    """The jobs, each with its part of the shards."""
+    workers = min(resources.workers, len(numbers))
     share = (
         {"gpus_per_node": 1}
         if plan.job.device == "cuda"
         else {"cpus_per_task": plan.job.threads}
     )
-    values = _OPTIONS | share | options
+    values = _OPTIONS | share | resources.slurm
     cluster = values.pop("cluster")
     try:
         executor = submitit.AutoExecutor(
             _logs(plan), cluster, **{f"{cluster}_max_num_timeout": _TIMEOUTS}
         )
         executor.update_parameters(name="lidar-synth-bake", **values)
+        return executor.map_array(
+            SlurmTask(), [plan] * workers, [numbers[k::workers] for k in range(workers)]
+        )
     except (RuntimeError, ValueError, NameError, TypeError) as error:
         raise ConfigError(
-            f"--slurm {options} ({error})",
-            "a machine that submits to Slurm, and options of submitit",
+            f"--slurm {resources.slurm} ({error})",
+            "a machine that submits to Slurm, and options of submitit that Slurm accepts",
         ) from error
-    return executor
 
 
 def _logs(plan: BakePlan) -> Path:
