@@ -337,6 +337,15 @@ def test_a_missing_library_of_an_engine_is_reported(
     assert list(plan.out.iterdir()) == []  # the corrected call may use it
 
 
+def test_a_missing_library_of_the_compression_is_reported_before_the_claim(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of a bake into a URL, where a claim stays."""
+    monkeypatch.setitem(sys.modules, "hdf5plugin", None)
+    with pytest.raises(LibraryError, match="a bank with Blosc2, but hdf5plugin"):
+        plan_in(tmp_path, model, compression="blosc2")
+
+
 def test_a_bake_that_fails_before_its_first_shard_leaves_no_claim(
     plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,6 +21,7 @@ import torch
 from lidar_synth.bake.conditions import conditions_for, fingerprint, settle_objects
 from lidar_synth.bake.options import BakeJob, default_shard_size
 from lidar_synth.bank import Entry, Facts
+from lidar_synth.bank.chunks import filters
 from lidar_synth.bank.encoding import TYPES
 from lidar_synth.bank.storage import bank_root, is_url
 from lidar_synth.errors import ConfigError, choose
@@ -100,11 +101,13 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
         ConfigError: on an unknown model, solver or data type, a field that the model does not
             generate, a conditional model without conditions, or objects for a model without
             layouts.
-        LibraryError: if objects are to be cast and embreex is missing.
+        LibraryError: if objects are to be cast and embreex is missing; on Blosc2 without
+            hdf5plugin.
         FileError, DataError: if the checkpoint or the dataset of the conditions cannot be read.
     """
     choose("solver", job.solver, SOLVERS)
     choose("dtype", job.dtype, DTYPES)
+    filters(job.compression)
     if job.first + job.count >= 2**63:
         raise ConfigError(
             f"scans up to index {job.first + job.count}", "less than 2^63"
