@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from mixtures import SENSOR, Scans
-from test_generator import write
+from small_models import SENSOR as GRID
+from test_generator import write, write_latent
 from torch.utils.data import DataLoader, Dataset
 
 from lidar_synth.bank.encoding import Encoding
@@ -279,6 +280,17 @@ def test_invalid_options_and_requests_are_refused(
             bank[number]
     with pytest.raises(RuntimeError, match="should only be shared between processes"):
         pickle.dumps(bank)
+
+
+def test_a_rolling_bank_of_fewer_columns(tmp_path: Path) -> None:
+    path = write_latent(tmp_path / "dense.safetensors", "surfaces")
+    half = load_generator(path, columns=GRID.columns // 2)
+    options: Any = {"columns": half.columns, "slots": 2, "threads": 1}
+    with RollingBank(path, **options) as bank:
+        [expected] = half.scans(0, [1])
+        assert (bank.sensor, bank[1].sensor) == (half.sensor, half.sensor)
+        assert bank[1].provenance == expected.provenance
+        assert bank.identity.endswith(f":{half.columns} columns")
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model, load_generator
-from lidar_synth.geometry import SYNTHETIC, RangeImage, Scan
+from lidar_synth.geometry import SYNTHETIC, RangeImage, Scan, model_provenance
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.labels.own import check_count
 from lidar_synth.mixing.service.client import Client
@@ -68,7 +68,7 @@ class RollingBank:
         timeout: maximum seconds of any wait, be it for the model to load or for one scan.
         threads: of torch in the generator process; None = torch's default.
         steps, solver: as for ``Generator.range_images``.
-        options: device, dtype, compile and batch, as for ``load_generator``.
+        options: device, dtype, compile, batch and columns, as for ``load_generator``.
 
     Attributes:
         sensor: the sensor that defines the scans' grid.
@@ -119,16 +119,19 @@ class RollingBank:
             {"confidence"} if "label" in header.channels else set()
         )
         replaced = max(1, round(refresh * slots)) if refresh else 0
-        self.sensor = header.sensor
+        columns = options.get("columns") or header.sensor.columns
+        self.sensor = replace(header.sensor, columns=columns)
+        width = "" if self.sensor == header.sensor else f":{columns} columns"
         self.fields = frozenset(channels - {"range"} | {"reflectance"})
         dtype = str(options.get("dtype", "torch.float32"))
         precision = "" if dtype.endswith("float32") else f":{dtype}"
         self.identity = (
             f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:"
-            f"{starved}:{replaced}{precision}"
+            f"{starved}:{replaced}{width}{precision}"
         )
         self._name = f"{path.stem}/{seed}"
-        self._slots = Slots(Encoding(header.sensor, channels), slots + replaced)
+        self._provenance = model_provenance(path.stem, checksum, seed)
+        self._slots = Slots(Encoding(self.sensor, channels), slots + replaced)
         plan = GeneratorJob(
             path,
             seed,
@@ -158,6 +161,7 @@ class RollingBank:
             unproject(self._slots.encoding.decode(arrays)),
             id=f"{self._name}/{served}",
             domain=SYNTHETIC,
+            provenance=self._provenance,
         )
 
     def image(self, number: int) -> RangeImage:
