@@ -14,7 +14,7 @@ from typing import Any
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
-from lidar_synth.errors import ConfigError, FileError, LibraryError, needs
+from lidar_synth.errors import ConfigError, FileError, LibraryError
 
 # Lost actors per worker, without a finished shard in between, after which the bake fails.
 _LOSSES = 5
@@ -40,12 +40,12 @@ def bake_on_ray(
     """Write the shards with ``resources.workers`` actors.
 
     Raises:
-        LibraryError: if Ray or this package is not installed, here or on a node.
+        LibraryError: if this package is not installed on a node.
         ConfigError: if no cluster is running at the address.
         FileError, DataError: as ``bake_shard``.
     """
-    with needs("ray", "engine 'ray', but ray"):
-        import ray
+    import ray
+
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     started = not ray.is_initialized()
     if started:

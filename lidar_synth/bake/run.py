@@ -8,6 +8,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 
 from tqdm import tqdm
 
@@ -21,7 +22,7 @@ from lidar_synth.bake.share import Share
 from lidar_synth.bake.slurm import bake_on_slurm
 from lidar_synth.bake.torchrun import take_part
 from lidar_synth.bank import Index
-from lidar_synth.errors import choose
+from lidar_synth.errors import choose, needs
 from lidar_synth.generate.devices import check_device
 
 Engine = Callable[[BakePlan, Sequence[int], Resources, Progress], None]
@@ -43,6 +44,27 @@ ENGINES: dict[str, Engine] = {
     "torchrun": bake_local,  # its part of the shards
 }
 """Engines by name; each of them runs ``bake_shard``."""
+
+LIBRARIES = {"ray": "ray", "slurm": "submitit"}
+"""The libraries of engines, whose devices are in other machines."""
+
+
+def check_engine(engine: str, plan: BakePlan) -> None:
+    """Check that an engine can start on this machine.
+
+    Raises:
+        ConfigError: on an unknown engine, a device that is not available, or ``torchrun`` in a
+            process that torchrun did not start.
+        LibraryError: if the engine's library is not installed.
+    """
+    choose("engine", engine, ENGINES)
+    if library := LIBRARIES.get(engine):
+        with needs(engine, f"engine {engine!r}, but {library}"):
+            import_module(library)
+    else:
+        check_device(plan.job.device)
+    if engine == "torchrun":
+        take_part(plan, range(0))
 
 
 def bake(
@@ -71,11 +93,9 @@ def bake(
         LibraryError: if the engine's library is not installed.
         KeyboardInterrupt: on SIGINT or SIGTERM; finished shards are kept.
     """
-    run = choose("engine", engine, ENGINES)
+    check_engine(engine, plan)
     resources = resources or Resources()
     share = share or Share()
-    if engine not in ("ray", "slurm"):  # whose devices are in other machines
-        check_device(plan.job.device)
     plan = prepare(plan)
     with _terminated_as_interrupted(), _releasing(plan):
         with at_work(plan):
@@ -98,7 +118,7 @@ def bake(
                     smoothing=0.05,
                     disable=not progress,
                 ) as bar:
-                    run(plan, missing, resources, bar.update)
+                    ENGINES[engine](plan, missing, resources, bar.update)
         return finish(plan)
 
 

@@ -16,7 +16,7 @@ from lidar_synth.bake.folder import LOGS
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
-from lidar_synth.errors import ConfigError, FileError, LidarSynthError, needs
+from lidar_synth.errors import ConfigError, FileError, LidarSynthError
 
 # Submitit's default of 5 minutes may be too short for a shard.
 _OPTIONS = {"cluster": "slurm", "timeout_min": 240}
@@ -45,13 +45,12 @@ def bake_on_slurm(
     """Write the shards with an array of ``resources.workers`` jobs and wait for them.
 
     Raises:
-        LibraryError: if submitit is not installed.
         ConfigError: if Slurm is not available, or on an option that submitit does not have or Slurm
             refuses.
         FileError: if a job failed; the others are cancelled.
     """
-    with needs("slurm", "engine 'slurm', but submitit"):
-        import submitit
+    import submitit
+
     jobs = _submit(submitit, plan, numbers, resources)
     try:
         for job in submitit.helpers.as_completed(jobs, poll_frequency=_POLL):

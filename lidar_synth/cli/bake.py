@@ -174,12 +174,11 @@ def _report_unboxed(bank: str) -> None:
 
 def _describe(plan: "BakePlan", engine: str) -> None:
     """Print what a bake would write; the time and size are estimated from a few scans."""
-    from lidar_synth.bake import ENGINES
     from lidar_synth.bake.estimate import estimate
     from lidar_synth.bake.folder import check_settings
-    from lidar_synth.errors import choose
+    from lidar_synth.bake.run import check_engine
 
-    choose("engine", engine, ENGINES)
+    check_engine(engine, plan)
     plan = check_settings(plan)
     job = plan.job
     shards = plan.shards
@@ -188,14 +187,18 @@ def _describe(plan: "BakePlan", engine: str) -> None:
     minutes = expected.seconds / 60
     disk = f"{size:.3g} MB" if size < 1000 else f"{size / 1e3:.3g} GB"
     time = f"{minutes:.1f} minutes" if minutes < 120 else f"{minutes / 60:.1f} hours"
+    if minutes < 2:
+        time = f"{expected.seconds:.0f} seconds"
+    elsewhere = "" if expected.device == job.device else f" on a {expected.device}"
     shard = size / job.count * max(entry.scans for entry in shards)
     echo(
-        f"{plan.out}: {job.count} scans in {len(shards)} shards of up to {job.shard_size}\n"
+        f"{plan.out}: {job.count} scans in {len(shards)} shard{'s'[: len(shards) - 1]} of up to "
+        f"{job.shard_size}\n"
         f"  model {plan.facts.model} {plan.facts.checkpoint[:12]}, sensor "
         f"{plan.facts.sensor.name}\n"
-        f"  fields: range, {', '.join(plan.facts.fields)}; label policy "
+        f"  fields: {', '.join(('range', *plan.facts.fields))}; label policy "
         f"{plan.facts.label_policy}\n"
         f"  about {disk}, {expected.bytes / job.count / 1e3:.0f} kB per scan\n"
-        f"  about {time} with one worker, {job.count / expected.seconds:.2f} scans/s\n"
+        f"  about {time} with one worker{elsewhere}, {job.count / expected.seconds:.2f} scans/s\n"
         f"  up to {2 * shard:.3g} MB of memory a worker for its shard, beside the model"
     )

@@ -1,0 +1,47 @@
+"""What ``lidar-synth bake`` refuses or says before it starts."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from small_models import write
+from typer.testing import CliRunner
+
+from lidar_synth.cli import app
+from lidar_synth.errors import ConfigError, LibraryError
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("model") / "small.safetensors")
+
+
+def run(model: Path, out: Path, options: str) -> Any:
+    call = ["bake", str(out), "--model", str(model), "--count", "4", *options.split()]
+    return CliRunner().invoke(app, call, catch_exceptions=False)
+
+
+def test_a_dry_run_needs_no_gpu_where_the_bake_needs_none(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "submitit", sys)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    on_slurm = "--device cuda --engine slurm --fields label --dry-run"
+    output = run(model, tmp_path, on_slurm).output
+    assert "4 scans in 1 shard of up to 64" in output
+    assert "fields: range, label; " in output
+    assert "seconds with one worker on a cpu, " in output
+    with pytest.raises(ConfigError, match="device 'cuda'"):
+        run(model, tmp_path, "--device cuda --dry-run")
+
+
+def test_a_dry_run_needs_what_the_engine_needs(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(LibraryError, match="engine 'ray', but ray cannot be imported"):
+        run(model, tmp_path, "--engine ray --dry-run")
+    with pytest.raises(ConfigError, match="engine 'torchrun' without 'RANK'"):
+        run(model, tmp_path, "--engine torchrun --dry-run")
