@@ -45,3 +45,31 @@ def test_a_dry_run_needs_what_the_engine_needs(
         run(model, tmp_path, "--engine ray --dry-run")
     with pytest.raises(ConfigError, match="engine 'torchrun' without 'RANK'"):
         run(model, tmp_path, "--engine torchrun --dry-run")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            "--engine local --workers 8",
+            "--workers with engine 'local'; expected engine 'processes' or 'ray'",
+        ),
+        ("--engine processes --address auto", "--address with engine 'processes'"),
+        ("--engine local --slurm cluster=local", "--slurm with engine 'local'"),
+        ("--num-shards 16", "--num-shards 16 without --shard-index; expected"),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(
+    options: str, message: str, model: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        run(model, tmp_path / "bank", options)
+    assert not (tmp_path / "bank").exists()
+
+
+def test_workers_without_a_shard_are_reported(model: Path, tmp_path: Path) -> None:
+    options = "--count 20 --shard-size 10 --workers 7 --dry-run"
+    assert run(model, tmp_path, options).output.startswith(
+        "2 shards for 7 workers: --shard-size 3 uses all\n"
+    )
+    assert "uses all" not in run(model, tmp_path, "--dry-run").output

@@ -21,7 +21,7 @@ import lidar_synth.bank.writer as writer
 from lidar_synth.bank import Bank
 from lidar_synth.bank.shard import _GAP, _side_by_side
 from lidar_synth.bank.storage import LocalFile, RangedFile, RemoteFile
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.sensor import load_sensor
 
@@ -128,6 +128,11 @@ def test_what_fsspec_is_configured_with_is_kept(
     for scheme in ("http", "https"):
         system, _ = storage.open_system(f"{scheme}://bank.invalid/bank")
         assert system.client_kwargs == {"trust_env": True} | login
+
+
+def test_a_limit_without_a_cache_is_refused(served: Served) -> None:
+    with pytest.raises(ConfigError, match="limit='1GB' without cache="):
+        Bank(f"{served.url}/bank", limit="1GB")
 
 
 def test_a_server_without_ranges_is_refused(served: Served) -> None:

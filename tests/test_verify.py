@@ -329,6 +329,11 @@ def test_a_shard_may_be_open_in_plain_h5py(root: Path) -> None:
         assert len(bank[4].points)
 
 
+def test_options_of_deep_verification_alone_are_refused(root: Path) -> None:
+    with pytest.raises(ConfigError, match="--sample and --seed without --deep"):
+        call("verify", root, "--sample", 3, "--seed", 0)
+
+
 def test_deep_verification_finds_scans_that_do_not_match_their_seeds(
     tmp_path: Path, model: Path
 ) -> None:

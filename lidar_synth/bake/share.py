@@ -38,16 +38,25 @@ class Share:
             )
 
 
-def read_share(index: str, number: int | None) -> Share:
+def read_share(index: str | None, number: int | None) -> Share:
     """The share of a run as the command line names it.
 
     Args:
-        index: of the share; ``"auto"`` takes that of the array job that this process belongs to.
+        index: of the share; ``"auto"`` takes that of the array job that this process belongs to;
+            None for all shards.
         number: of shares; by default 1, or the size of the array job.
 
     Raises:
-        ConfigError: outside an array job, in one with gaps, or on anything but numbers.
+        ConfigError: outside an array job, in one with gaps, on anything but numbers, or on several
+            shares without an index.
     """
+    if index is None and number is not None:
+        raise ConfigError(
+            f"--num-shards {number} without --shard-index",
+            "the index of this run's share",
+            "--shard-index auto in an array job.",
+        )
+    index = index or "0"
     size = "1" if number is None else str(number)
     if index == "auto":
         found = next((name for name in _ARRAYS if name in os.environ), None)

@@ -271,6 +271,8 @@ def _settle(root: str | Path) -> str | Path:
 def _open_cache(
     root: str | Path, cache: str | Path | None, limit: int | str | None, index: Index
 ) -> ShardCache | None:
+    if cache is None and limit is not None:
+        raise ConfigError(f"limit={limit!r} without cache=", "a folder for the copies")
     if cache is None:
         return None
     if isinstance(root, Path):

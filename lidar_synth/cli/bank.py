@@ -6,7 +6,7 @@ from typing import Annotated
 
 from typer import Argument, Exit, Option, Typer, echo
 
-from lidar_synth.cli.options import Json, local_path
+from lidar_synth.cli.options import Json, drop_missing, local_path
 
 BankFolder = Annotated[str, Argument(metavar="BANK", help="folder or URL of a bank")]
 Model = Annotated[
@@ -30,8 +30,8 @@ def verify(
         ),
     ] = False,
     sample: Annotated[
-        int, Option(min=1, help="number of scans that --deep regenerates")
-    ] = 16,
+        int | None, Option(min=1, help="number of scans that --deep regenerates [16]")
+    ] = None,
     seed: Annotated[
         int | None, Option(min=0, help="seed that selects these scans [random]")
     ] = None,
@@ -52,7 +52,11 @@ def verify(
 
     from lidar_synth.bake.verify import AGREE, UNLISTED, regenerate
     from lidar_synth.bake.verify import verify as run
+    from lidar_synth.errors import ConfigError
 
+    options = {"sample": sample, "seed": seed, "model": model, "condition": condition}
+    if not deep and (given := drop_missing(options)):
+        raise ConfigError(f"--{' and --'.join(given)} without --deep", "--deep as well")
     problems = run(bank)
     for problem in problems:
         echo(f"{problem.file}: {problem.what}", err=True)
@@ -66,7 +70,7 @@ def verify(
         return
     seed = secrets.randbits(32) if seed is None else seed
     echo(f"{bank}: scans selected by --seed {seed}")
-    shares = regenerate(bank, model, sample, seed=seed, condition=condition)
+    shares = regenerate(bank, model, sample or 16, seed=seed, condition=condition)
     different = {name: share for name, share in shares.items() if share < AGREE}
     for name, share in different.items():
         echo(
