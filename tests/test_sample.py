@@ -233,3 +233,26 @@ def test_a_time_grid_is_given_by_hand(path: Path, tmp_path: Path) -> None:
     assert np.array_equal(open_scans(out)[0].points, made.points)
     other = CliRunner().invoke(app, [*given, "--times", "1,0.6,0.2,0"])
     assert isinstance(other.exception, ConfigError)
+
+
+def test_sample_says_what_the_format_cannot_hold_and_resumes_by_another_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lidar_synth.cli import app
+
+    monkeypatch.chdir(tmp_path)
+    model = write(tmp_path / "laid.safetensors", dropout=0.1, condition="layout")
+    layout = tmp_path / "street.yaml"
+    layout.write_text("objects: [{class: Car, at: [8, 2]}, {class: Car, at: [-7, 2]}]")
+
+    def sample(to: str, condition: Path) -> str:
+        call = ["sample", to, "--to", to, "--model", str(model), "--count", "1"]
+        call += ["--condition", str(condition)]
+        result = CliRunner().invoke(app, call, catch_exceptions=False)
+        return result.output
+
+    assert "dropped boxes of 1 scans, which kitti cannot hold" in sample(
+        "kitti", layout
+    )
+    assert "0 scans written, 1 were there" in sample("kitti", Path("street.yaml"))
+    assert "boxes outside the camera's view of 1" in sample("kitti_object", layout)

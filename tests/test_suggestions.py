@@ -41,7 +41,7 @@ COMMANDS = {
     "sample OUT --to kiti": "Did you mean 'kitti'",
     "sample OUT --dtype fp16": "'float32', 'bfloat16'",
     "sample OUT --device gpu": "expected an available one: cpu",
-    "sample OUT --count 0": "Invalid value for '--count'",
+    "sample OUT --count 0": "sample: count = 0",
     "sample OUT --cout 5": "Did you mean '--count'",
     "sample OUT --num 5": "Did you mean '--count'",
     "sample OUT --format kitti": "Did you mean '--to'",

@@ -113,7 +113,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
             f"scans up to index {job.first + job.count}", "less than 2^63"
         )
     generator = load_generator(job.model, columns=job.columns)
-    condition = job.condition and _settle_path(job.condition)
+    condition = job.condition and settle_path(job.condition)
     source = conditions_for(
         generator, condition, job.condition_layout, job.condition_split
     )
@@ -164,10 +164,10 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
         layout=job.layout,
     )
     # Absolute, as actors of Ray work in other folders.
-    return BakePlan(bank_root(_settle_path(out)), resolved, facts)
+    return BakePlan(bank_root(settle_path(out)), resolved, facts)
 
 
-def _settle_path(path: str | Path) -> str:
+def settle_path(path: str | Path) -> str:
     """The path of a bank or a dataset from any folder, or its URL."""
     return str(path if is_url(path) else Path(path).resolve())
 

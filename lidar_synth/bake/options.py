@@ -1,5 +1,5 @@
-"""The settings of a bake. The options of ``lidar-synth bake`` are generated from the fields of
-``BakeJob``.
+"""The settings of a bake and of ``sample``. The options of both commands are generated from the
+fields of ``BakeJob`` and ``Drawing``.
 
 This module imports no heavy library, so that the command line starts at once.
 """
@@ -16,35 +16,21 @@ def default_shard_size(count: int) -> int:
     return min(1024, max(64, count // 8))
 
 
-class BakeJob(BaseModel):
-    """Settings of a bake; unknown keys are refused. ``BakeJob.model_fields`` describes each of
-    them.
-
-    Example:
-        >>> job = BakeJob(count=20_000, seed=1)
-        >>> BakeJob.model_fields["first"].description
-        'index of the first scan'
-    """
+class Drawing(BaseModel):
+    """How a model generates scans: the options that ``sample`` and ``bake`` share; unknown keys
+    are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: str = Field(
         "town", description="name of a shipped model, or a .safetensors checkpoint"
     )
-    count: Count = Field(1000, description="number of scans")
+    count: Count = Field(16, description="number of scans")
     seed: int = Field(
         0,
         ge=0,
         lt=2**64,
         description="scan i is a function of the model, the seed and i",
-    )
-    first: int = Field(0, ge=0, lt=2**62, description="index of the first scan")
-    shard_size: Count | None = Field(
-        None,
-        description=(
-            "scans per file, which an interrupted bake keeps; a worker needs the "
-            "memory of two files [an eighth of all, 64 to 1024]"
-        ),
     )
     steps: Count | None = Field(None, description="number of steps [the model's own]")
     solver: str = Field("euler", description="ODE solver: euler | heun")
@@ -74,13 +60,6 @@ class BakeJob(BaseModel):
         le=100,
         description="scale of classifier-free guidance; 1 = no guidance",
     )
-    fields: tuple[str, ...] | None = Field(
-        None,
-        description=(
-            "what to store beside the range: reflectance,label,confidence [all that the model "
-            "generates]"
-        ),
-    )
     batch: Count | None = Field(
         None, description="scans per batch [1 on a CPU, 16 on a GPU]"
     )
@@ -91,6 +70,35 @@ class BakeJob(BaseModel):
     dtype: str = Field(
         "float32",
         description="data type of the network's computation: float32 | bfloat16",
+    )
+    device: str = Field("cpu", description="device of the network: cpu | cuda")
+
+
+class BakeJob(Drawing):
+    """Settings of a bake; unknown keys are refused. ``BakeJob.model_fields`` describes each of
+    them.
+
+    Example:
+        >>> job = BakeJob(count=20_000, seed=1)
+        >>> BakeJob.model_fields["first"].description
+        'index of the first scan'
+    """
+
+    count: Count = Field(1000, description="number of scans")
+    first: int = Field(0, ge=0, lt=2**62, description="index of the first scan")
+    shard_size: Count | None = Field(
+        None,
+        description=(
+            "scans per file, which an interrupted bake keeps; a worker needs the "
+            "memory of two files [an eighth of all, 64 to 1024]"
+        ),
+    )
+    fields: tuple[str, ...] | None = Field(
+        None,
+        description=(
+            "what to store beside the range: reflectance,label,confidence [all that the model "
+            "generates]"
+        ),
     )
     device: Literal["cpu", "cuda"] = Field(
         "cpu", description="device of the network: cpu | cuda"

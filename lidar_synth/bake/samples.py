@@ -1,81 +1,117 @@
 """Generated scans in the files of any format."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 from tqdm import tqdm
 
 from lidar_synth.bake.conditions import (
     ConditionSource,
     conditions,
+    conditions_for,
     fingerprint,
     open_objects,
+    settle_objects,
 )
+from lidar_synth.bake.job import DTYPES, settle_path
+from lidar_synth.bake.options import Drawing
 from lidar_synth.datasets.recordings import NOTE, seen_by
-from lidar_synth.formats.writer import Writer
+from lidar_synth.errors import choose
+from lidar_synth.formats import WRITERS
+from lidar_synth.formats.convert import Report
 from lidar_synth.generate.generator import Generator, SamplingOptions
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry import Scan
 
+_ELSEWHERE = {
+    "model",
+    "count",
+    "batch",
+    "device",
+    "condition_layout",
+    "condition_split",
+}
+"""Settings that change no file, or that the names of the model and of the conditions tell."""
 
-@dataclass(frozen=True)
-class ScansOfSeed:
-    """The scans of a seed by number.
+
+def write_samples(
+    out: Path, job: Drawing, to: str, times: Sequence[float] | None = None
+) -> Report:
+    """Write those of a job's scans that are missing in a folder.
 
     Args:
-        generator: the model.
-        seed: of the scans.
-        source: their conditions; None for an unconditional model.
-        objects: what stands in the boxes of layouts, as ``settle_objects`` names it.
-        options: of the generator.
+        out: the folder.
+        job: the settings.
+        to: the format, a key of ``WRITERS``.
+        times: the time grid, instead of the job's steps.
+
+    Raises:
+        ConfigError: as ``Writer.hold``, ``load_generator``, ``conditions_for`` and
+            ``Generator.scans``.
+        FileError, DataError: if the checkpoint or a condition cannot be read or a file be written.
+        LibraryError: if objects are to be cast and embreex is missing.
     """
+    writer = choose("--to", to, WRITERS)(out)
+    generator = load_generator(
+        job.model,
+        device=job.device,
+        dtype=choose("dtype", job.dtype, DTYPES),
+        batch=job.batch,
+        columns=job.columns,
+    )
+    source = conditions_for(
+        generator, job.condition, job.condition_layout, job.condition_split
+    )
+    provenance = generator.header.provenance
+    settings = {
+        **job.model_dump(exclude=_ELSEWHERE),
+        "to": to,
+        "times": times,
+        "condition": job.condition and settle_path(job.condition),
+        "objects": settle_objects(generator, job.objects),
+        "checkpoint": generator.hash,
+        "conditions": fingerprint(source),
+        "trained_on": provenance["data"],
+        "seen": seen_by(provenance).to_list(),
+    }
+    options: SamplingOptions = {
+        "steps": job.steps,
+        "times": times,
+        "solver": job.solver,
+        "guidance": job.guidance,
+    }
+    with writer.hold(NOTE, settings):
+        missing = [i for i in range(job.count) if not writer.complete(i)]
+        report = Report(kept=job.count - len(missing))
+        made = _scans(
+            generator, job.seed, missing, source, settings["objects"], options
+        )
+        for index, scan in made:
+            writer.write(scan, index)
+            report.add(writer, scan)
+        writer.finish()
+    return report
 
-    generator: Generator
-    seed: int
-    source: ConditionSource | None
-    objects: str | None
-    options: SamplingOptions
 
-    def write(self, writer: Writer, count: int, settings: dict[str, Any]) -> int:
-        """Write those of the first ``count`` scans that are missing; returns how many they were.
-
-        Args:
-            writer: of the files.
-            count: number of scans.
-            settings: what else determines the files, as plain values.
-
-        Raises:
-            ConfigError: as ``Writer.hold`` and ``Generator.scans``.
-            FileError, DataError: if a condition cannot be read or a file be written.
-        """
-        provenance = self.generator.header.provenance
-        own = {
-            "checkpoint": self.generator.hash,
-            "seed": self.seed,
-            "conditions": fingerprint(self.source),
-            "objects": self.objects,
-            "trained_on": provenance["data"],
-            "seen": seen_by(provenance).to_list(),
-        }
-        with writer.hold(NOTE, {**self.options, **settings, **own}):
-            missing = [i for i in range(count) if not writer.complete(i)]
-            for index, scan in self._scans(missing):
-                writer.write(scan, index)
-            writer.finish()
-        return len(missing)
-
-    def _scans(self, numbers: Sequence[int]) -> Iterator[tuple[int, Scan]]:
-        """Numbers and their scans, with a progress bar."""
-        size = self.generator.batch
-        with tqdm(total=len(numbers), desc="scans", unit="scan") as bar:
-            for first in range(0, len(numbers), size):
-                batch = numbers[first : first + size]
-                scans = self.generator.scans(
-                    self.seed,
-                    batch,
-                    conditions(self.source, batch),
-                    open_objects(self.objects, self.generator.sensor),
-                    **self.options,
-                )
-                yield from zip(batch, scans, strict=True)
-                bar.update(len(batch))
+def _scans(
+    generator: Generator,
+    seed: int,
+    numbers: Sequence[int],
+    source: ConditionSource | None,
+    objects: str | None,
+    options: SamplingOptions,
+) -> Iterator[tuple[int, Scan]]:
+    """Numbers and their scans, with a progress bar."""
+    size = generator.batch
+    with tqdm(total=len(numbers), desc="scans", unit="scan") as bar:
+        for first in range(0, len(numbers), size):
+            batch = numbers[first : first + size]
+            scans = generator.scans(
+                seed,
+                batch,
+                conditions(source, batch),
+                open_objects(objects, generator.sensor),
+                **options,
+            )
+            yield from zip(batch, scans, strict=True)
+            bar.update(len(batch))

@@ -201,8 +201,7 @@ def _edit(context: Context, change: Callable[["Scan"], Any]) -> Any:
                 claim(writer.root / f".edit-{index}.json", call)
             camera = scans.calibration(index)
             writer.write(edited, index, name=scans.ids[index], calibration=camera)
-            report.written += 1
-            report.lost.update(writer.loses(edited, camera))
+            report.add(writer, edited, camera)
         writer.finish()
     print_report(report, given["out"], given["to"])
     return edited

@@ -20,6 +20,7 @@ from lidar_synth.files.disk import hash_of_names
 from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats import OnBad, ScanFiles, Writer
 from lidar_synth.formats.as_sensor import AsSensor
+from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import NAME, Origin, add_origin
 from lidar_synth.formats.models import models_of, write_models
 from lidar_synth.geometry import Scan, Sensor, Source
@@ -59,6 +60,14 @@ class Report:
     seen: list[float] = field(default_factory=list, compare=False)
     lost: Counter[str] = field(default_factory=Counter, compare=False)
     unlabelled: int = field(default=0, compare=False)
+
+    def add(
+        self, writer: Writer, scan: Scan, camera: Calibration | None = None
+    ) -> None:
+        """Count a scan that was written, and what it lost."""
+        self.written += 1
+        self.lost.update(writer.loses(scan, camera))
+        self.unlabelled += writer.always_labels and scan.label is None
 
 
 class Outcome(NamedTuple):
