@@ -23,7 +23,7 @@ from lidar_synth.bake.options import BakeJob, default_shard_size
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.chunks import filters
 from lidar_synth.bank.encoding import TYPES
-from lidar_synth.bank.storage import bank_root, is_url
+from lidar_synth.bank.storage import bank_root, settle_path
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.flow.solvers import SOLVERS
 from lidar_synth.generate.generator import BATCH
@@ -165,11 +165,6 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     )
     # Absolute, as actors of Ray work in other folders.
     return BakePlan(bank_root(settle_path(out)), resolved, facts)
-
-
-def settle_path(path: str | Path) -> str:
-    """The path of a bank or a dataset from any folder, or its URL."""
-    return str(path if is_url(path) else Path(path).resolve())
 
 
 def _fields(job: BakeJob, generated: frozenset[str]) -> tuple[str, ...]:

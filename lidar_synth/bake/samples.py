@@ -13,8 +13,9 @@ from lidar_synth.bake.conditions import (
     open_objects,
     settle_objects,
 )
-from lidar_synth.bake.job import DTYPES, settle_path
+from lidar_synth.bake.job import DTYPES
 from lidar_synth.bake.options import Drawing
+from lidar_synth.bank.storage import settle_path
 from lidar_synth.datasets.recordings import NOTE, seen_by
 from lidar_synth.errors import choose
 from lidar_synth.formats import WRITERS

@@ -328,6 +328,11 @@ def is_url(path: str | Path) -> bool:
     return isinstance(path, str) and "://" in path
 
 
+def settle_path(path: str | Path) -> str:
+    """The path of a bank or a dataset from any folder, or its URL."""
+    return str(path if is_url(path) else Path(path).resolve())
+
+
 def bank_root(root: str | Path) -> str | Path:
     """The place of a bank: a URL without a slash at its end, or the path of a folder."""
     return str(root).rstrip("/") if is_url(root) else Path(root)
