@@ -37,7 +37,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_a_source_is_not_edited_in_place(source: Path) -> None:
     before = files(source)
     with pytest.raises(ConfigError, match="inside of .*; expected a folder outside"):
-        call("remove", source, source, "--box", 0)
+        call("remove", source, source, "--name", "Car")
     assert files(source) == before
 
 
@@ -47,18 +47,19 @@ def test_recorded_scans_in_the_folder_stay_as_they_are(
     write_all("npz", tmp_path / "mine", [SCAN])
     before = files(tmp_path / "mine")
     with pytest.raises(ConfigError, match="mine holds files that this command did not"):
-        call("remove", source, tmp_path / "mine", "--box", 0)
+        call("remove", source, tmp_path / "mine", "--name", "Car")
     assert files(tmp_path / "mine") == before
 
 
 def test_a_scan_is_edited_once_in_a_folder_and_by_the_same_call(
-    source: Path, tmp_path: Path
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
     first = ("remove", source, out, "--box", 0, "--scan", 0)
     call(*first)
     before = files(out)
-    call(*first)
+    monkeypatch.chdir(source.parent)
+    call("remove", source.name, *first[2:])
     assert files(out) == before
     differs = (
         r"was filled with {'box': \[0\]}; expected {'box': \[1\]}. .*another folder"
@@ -72,30 +73,35 @@ def test_a_scan_is_edited_once_in_a_folder_and_by_the_same_call(
 
 def test_all_scans_are_edited_once_in_a_folder(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    call("remove", source, out, "--box", 0)
+    call("remove", source, out, "--name", "Car")
     before = files(out)
     assert len(before) == 3  # two scans, and one claim for both
-    call("remove", source, out, "--box", 0)
-    for other in [("--box", 1), ("--box", 1, "--scan", 1)]:
+    call("remove", source, out, "--name", "Car")
+    for other in [("--name", "Car", "--seed", 1), ("--box", 1, "--scan", 1)]:
         with pytest.raises(ConfigError, match=r"was filled with .*another folder"):
             call("remove", source, out, *other)
     assert files(out) == before
 
 
 def test_a_class_without_a_box_writes_nothing(source: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="class of some box in these scans: Car$"):
-        call("remove", source, tmp_path / "out", "--name", "Dragon")
+    alone = "--name Dragon; expected the class of some box in these scans: Car$"
+    for names in [("Dragon",), ("Car", "--name", "Dragon")]:
+        with pytest.raises(ConfigError, match=alone):
+            call("remove", source, tmp_path / "out", "--name", *names)
+    with pytest.raises(ConfigError, match="--box 0 of 2 scans; expected --scan"):
+        call("remove", source, tmp_path / "out", "--box", 0)
     assert not (tmp_path / "out").exists()
     with pytest.raises(DataError, match=r"box \[500\]"):
-        call("remove", source, tmp_path / "out", "--box", 500)
+        call("remove", source, tmp_path / "out", "--box", 500, "--scan", 0)
     assert not files(tmp_path / "out")
 
 
 def test_what_the_format_cannot_hold_is_named(source: Path, tmp_path: Path) -> None:
-    told = call("remove", source, tmp_path / "out", "--box", 0, "--to", "kitti")
-    assert "dropped boxes of 2 scans, which kitti cannot hold" in told
-    objects = call("remove", source, tmp_path / "o", "--box", 0, "--to", "kitti_object")
-    assert "dropped boxes outside the camera's view of 2 scans" in objects
+    given = ("--box", 0, "--scan", 0, "--to")
+    told = call("remove", source, tmp_path / "out", *given, "kitti")
+    assert "dropped boxes of 1 scans, which kitti cannot hold" in told
+    objects = call("remove", source, tmp_path / "o", *given, "kitti_object")
+    assert "dropped boxes outside the camera's view of 1 scans" in objects
 
 
 @pytest.mark.parametrize(
@@ -122,7 +128,7 @@ def test_scans_that_cannot_be_read_are_left_out_on_request(
 ) -> None:
     first, *_ = sorted(source.rglob("*.npz"))
     first.write_bytes(b"PK")
-    given = ("remove", source, tmp_path / "out", "--box", 0)
+    given = ("remove", source, tmp_path / "out", "--name", "Car")
     assert "1 scans written, 0 were there already, 1 skipped" in call(
         *given, "--on-bad", "skip"
     )

@@ -55,7 +55,7 @@ def remove_objects(
         Option(help="remove all boxes of this class, for instance Car"),
     ] = None,
     scan: Annotated[
-        int | None, Option(min=0, help="number of the scan in IN [all]")
+        int | None, Option(min=0, help="number of the scan in IN [all, for --name]")
     ] = None,
     model: Model = None,
     seed: Seed = 0,
@@ -172,6 +172,7 @@ def _edit(context: Context, change: Callable[["Scan"], Any]) -> Any:
     """
     from tqdm import tqdm
 
+    from lidar_synth.bank.storage import settle_path
     from lidar_synth.errors import ConfigError, choose
     from lidar_synth.files.claims import claim
     from lidar_synth.formats import WRITERS, open_scans
@@ -188,7 +189,15 @@ def _edit(context: Context, change: Callable[["Scan"], Any]) -> Any:
         raise ConfigError(f"--scan {number} of {len(scans)}", f"0 to {len(scans) - 1}")
     if names := given.get("name"):
         _require(names, filter(None, map(read, chosen)))
-    call = {"edit": context.info_name, **given, "out": None}
+    if number is None and given.get("box") and len(scans) > 1:
+        raise ConfigError(
+            f"--box {given['box'][0]} of {len(scans)} scans",
+            "--scan, the number of the scan that has these boxes",
+        )
+    paths = {
+        key: settle_path(given[key]) for key in ("source", "objects") if key in given
+    }
+    call = {"edit": context.info_name, **given, **paths, "out": None}
     of_all = call if number is None else dict.fromkeys(call)
     edited: Any = None
     with writer.hold(".edit.json", of_all | {"to": given["to"]}, scans):
@@ -214,10 +223,10 @@ def _require(names: list[str], scans: Iterable["Scan"]) -> None:
     there: set[str] = set()
     for scan in scans:
         there.update(scan.boxes.names if scan.boxes else ())
-        if there.intersection(names):
+        if there.issuperset(names):
             return
     raise ConfigError(
-        f"--name {', '.join(names)}",
+        f"--name {', '.join(name for name in names if name not in there)}",
         f"the class of some box in these scans: {', '.join(sorted(there)) or 'none'}",
     )
 
