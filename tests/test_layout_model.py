@@ -370,6 +370,28 @@ def test_the_command_line_takes_a_layout(
     )
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("objects: [{class: Dragon, at: [9, 0]}]", "Dragon"),
+        ("objects: [{class: Car, at: [900, 0]}]", "within the sensor's range"),
+    ],
+)
+def test_a_bad_layout_of_a_folder_stops_a_run_before_it_begins(
+    text: str, message: str, model: Path, tmp_path: Path
+) -> None:
+    given = tmp_path / "layouts"
+    given.mkdir()
+    (given / "a.yaml").write_text(LAYOUTS["two"])
+    (given / "b.yaml").write_text(text)
+    words = ["sample", str(tmp_path / "out"), "--model", str(model), "--count", "2"]
+    words += ["--condition", str(given), "--objects", "drawn"]
+    with pytest.raises((ConfigError, DataError), match=message):
+        CliRunner().invoke(app, words, catch_exceptions=False)
+    (given / "b.yaml").write_text(LAYOUTS["none"])
+    assert CliRunner().invoke(app, words).exit_code == 0
+
+
 def test_rows_of_boxes_are_encoded_and_refused() -> None:
     rng = np.random.default_rng(0)
     values = rng.uniform(

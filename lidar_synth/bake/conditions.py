@@ -123,8 +123,8 @@ def conditions_for(
     Raises:
         ConfigError: if a conditional model gets no conditions or an unconditional one gets some,
             and as ``open_conditions``.
-        DataError: if the dataset's camera is unknown or differs from that of the training, and as
-            ``open_conditions``.
+        DataError: if the dataset's camera is unknown or differs from that of the training, a
+            layout is invalid or does not fit the model, and as ``open_conditions``.
         FileError: as ``open_conditions``.
     """
     if (generator.condition is None) != (path is None):
@@ -140,11 +140,14 @@ def conditions_for(
         )
     open_conditions.cache_clear()  # there may be more by now
     source = open_conditions(path, layout, split)
-    if isinstance(source, LayoutFiles) and generator.condition != "layout":
-        raise ConfigError(
-            f"layouts for model {generator.name!r}",
-            f"a dataset whose scans have {generator.condition}",
-        )
+    if isinstance(source, LayoutFiles):
+        if generator.condition != "layout":
+            raise ConfigError(
+                f"layouts for model {generator.name!r}",
+                f"a dataset whose scans have {generator.condition}",
+            )
+        for index in range(len(source)):  # before a folder is claimed for them
+            generator.condition_tensor(source.read(index), 1)
     if isinstance(source, ScanFiles) and generator.condition:
         check_camera(
             source, generator.header.conditioning[generator.condition].get("focal")

@@ -245,7 +245,7 @@ class Generator:
         """
         if not len(indices):
             return []
-        given = self._condition(condition, len(indices))
+        given = self.condition_tensor(condition, len(indices))
         laid = self.condition == "layout"
         boxes = boxed.boxes_of(condition, len(indices)) if laid else None
         cast = boxes is not None and isinstance(objects, boxed.Drawer)
@@ -318,7 +318,7 @@ class Generator:
         Arguments and errors are those of ``range_images``.
         """
         refuse_worker(self.device)
-        given = self._condition(condition, len(indices))
+        given = self.condition_tensor(condition, len(indices))
         codec = self.codec
         grid = self.header.grid(steps) if times is None else read_grid(times)
         if times is not None and steps is not None:
@@ -378,7 +378,7 @@ class Generator:
             mean_velocity(self.network.velocity, grid), guidance, unconditional
         ), encode(condition)
 
-    def _condition(self, given: Any, count: int) -> Tensor | None:
+    def condition_tensor(self, given: Any, count: int) -> Tensor | None:
         """The conditions (B, ...) as the network takes them, on its device."""
         if given is None and self.condition is None:
             return None
