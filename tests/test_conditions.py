@@ -146,6 +146,17 @@ def test_views_are_resized_one_by_one_between_their_corners(tmp_path: Path) -> N
     assert np.abs(made[0, :, view] - wanted.clip(0, 255)).max() <= 0.51
 
 
+def test_a_grey_image_of_16_bits_is_that_of_8_bits(tmp_path: Path) -> None:
+    grey = np.arange(40 * 80, dtype=np.uint16).reshape(40, 80) * 20
+    made = []
+    for name, values in (("a", grey), ("b", (grey >> 8).astype(np.uint8))):
+        path = tmp_path / f"{name}.png"
+        Image.fromarray(values).save(path)
+        scan = replace(random_scan(SENSOR, 10), image_path=path)
+        made.append(batch_of("camera", scan, 1, SENSOR, CAMERA_SHAPE, {}))
+    assert torch.equal(*made) and made[0].float().std() > 10
+
+
 def cubic(at: NDArray[np.float64], place: int) -> NDArray[np.float64]:
     """Keys' kernel with a = -0.75, which PyTorch's bicubic interpolation uses."""
     x = np.abs(at - place)
@@ -351,7 +362,7 @@ def test_scans_without_the_condition_are_refused(tmp_path: Path) -> None:
             CAMERA_SHAPE,
             OPTIONS,
         )
-    with pytest.raises(DataError, match=r"nowhere.png cannot be read"):
+    with pytest.raises(FileError, match=r"nowhere.png does not exist"):
         batch_of(
             "camera",
             replace(scan, image_path=tmp_path / "nowhere.png"),

@@ -411,3 +411,15 @@ def read_picture(path: Path, expected: str = "a PNG or JPEG file") -> "Image":
         f"at most {MOST_PIXELS} pixels",
         SKIP_HINT,
     )
+
+
+def read_rgb(path: Path) -> "Image":
+    """Read an image as 8-bit red, green and blue; 16-bit grey values keep their higher bytes, as
+    Pillow keeps those of 16-bit colours. Raises as ``read_picture``."""
+    from PIL import Image
+
+    image = read_picture(path)
+    # Pillow itself would clip them. It has two names for 16 bits, by its version.
+    if image.mode.startswith("I"):
+        image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+    return image.convert("RGB")

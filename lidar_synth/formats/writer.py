@@ -28,7 +28,7 @@ from lidar_synth.files.disk import (
     refuse_links,
     write_file,
 )
-from lidar_synth.files.parsing import parse_json, read_picture
+from lidar_synth.files.parsing import parse_json, read_rgb
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import (
     NAME,
@@ -299,9 +299,7 @@ def write_image(path: Path, picture: Picture) -> None:
     from PIL import Image as pillow
 
     opened = (
-        read_picture(picture)
-        if isinstance(picture, Path)
-        else pillow.fromarray(picture)
+        read_rgb(picture) if isinstance(picture, Path) else pillow.fromarray(picture)
     )
     write_file(path, lambda file: opened.convert("RGB").save(file, "PNG"))
 

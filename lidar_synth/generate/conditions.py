@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
-from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.parsing import read_picture
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files.parsing import read_rgb
 from lidar_synth.geometry import LABELLED_ONLY, Scan, Sensor
 from lidar_synth.geometry.layout import CHANNELS, CODES, Layout, layout_image, layout_of
 from lidar_synth.geometry.layout.raster import depths_of
@@ -177,19 +177,15 @@ class CameraImage(Condition):
         """The image taken with the scan, see ``resize_image``.
 
         Raises:
-            DataError: on a scan without an image, one that cannot be read, or of another size.
+            FileError: if the image cannot be read.
+            DataError: on a scan without an image, a damaged one, or one of another size.
         """
         if scan.image_path is None:
             raise DataError(
                 f"scan {scan.id!r} has no camera image",
                 "a scan with an image_path, to condition on",
             )
-        try:
-            image = read_picture(scan.image_path)
-        except FileError as error:
-            raise DataError(
-                f"the image {scan.image_path} cannot be read ({error})", "a PNG or JPEG"
-            ) from error
+        image = read_rgb(scan.image_path)
         return resize_image(image, shape, options, f"the image {scan.image_path}")
 
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
@@ -206,7 +202,7 @@ def resize_image(
     """A camera image as a condition.
 
     Args:
-        image: of the camera.
+        image: of the camera, in red, green and blue.
         shape: (3, h, w) of the condition.
         options: of the condition; ``options["image"]`` are the rows and columns that the image must
             have. They identify the camera of the training; an image with another field of view
@@ -231,7 +227,6 @@ def resize_image(
             f"{wanted}, those of the camera that the model was trained on",
             "Crop or pad it, by its calibration, to what that camera sees.",
         )
-    image = image.convert("RGB")
     if views := options.get("views"):
         return _resize_views(np.asarray(image, np.uint8), shape, views)
     small = image.resize((shape[2], shape[1]), Resampling.BICUBIC)

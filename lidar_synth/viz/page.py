@@ -23,7 +23,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
-from lidar_synth.files.parsing import read_picture
+from lidar_synth.files.parsing import read_rgb
 from lidar_synth.geometry import RangeImage, Scan
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Orbit, box_segments, render, ring_segments
@@ -188,6 +188,6 @@ def _data_uri(pixels: Rgb, kind: str = "PNG") -> str:
 
 
 def _camera_image(path: Path) -> str:
-    small = read_picture(path).convert("RGB")
+    small = read_rgb(path)
     small.thumbnail((1200, 600))
     return _data_uri(np.asarray(small), "JPEG")
