@@ -175,7 +175,7 @@ VALUES: dict[str, Callable[[dict[str, Any], Path | None], None]] = {
     "train": _train,
     "distill": _config(DistillConfig),
     "bake": _bake,
-    "town": _one_of("layout", ("kitti360", "semantic_kitti", "kitti")),
+    "town": _one_of("layout", ("kitti360", "semantic_kitti", "kitti", "kitti_object")),
     "convert": _one_of("to", (*WRITERS,)),
     "sample": _one_of("to", (*WRITERS,)),
     "evaluate": _one_of("protocol", (*PROTOCOLS,)),

@@ -362,7 +362,7 @@ def test_scans_without_the_condition_are_refused(tmp_path: Path) -> None:
             CAMERA_SHAPE,
             OPTIONS,
         )
-    with pytest.raises(FileError, match=r"nowhere.png does not exist"):
+    with pytest.raises(FileError, match=r"nowhere.png cannot be read"):
         batch_of(
             "camera",
             replace(scan, image_path=tmp_path / "nowhere.png"),

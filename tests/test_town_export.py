@@ -280,20 +280,39 @@ def test_a_folder_is_not_continued_by_a_town_of_other_tables(
         )
 
 
-def test_scans_name_their_skin_and_its_licence() -> None:
-    scan = Town(5, "pandar64", 1, skin="pandar64")[0]
+def test_scans_and_their_folder_name_their_skin_and_its_licence(tmp_path: Path) -> None:
+    town = Town(5, "pandar64", 1, skin="pandar64")
+    scan = town[0]
     assert "PandaSet" in scan.provenance["skin_licence"]
     assert scan.provenance["skin"] == load_skin("pandar64").digest
+    export_town(town, tmp_path, "kitti_object", camera=False, progress=False)
+    text = (tmp_path / "README.md").read_text()
+    assert "PandaSet by Scale AI and Hesai" in text and "licence: CC BY 4.0" in text
+    assert "layout: kitti;" in text
 
 
 @pytest.mark.parametrize(
-    ("layout", "jobs", "sequence"),
-    [("kitti-360", 1, None), ("kitti360", 0, None), ("kitti360", 1, 100)],
+    ("layout", "jobs", "sequence", "message"),
+    [
+        (
+            "kitti-360",
+            1,
+            None,
+            "layout 'kitti-360'; expected .*Did you mean 'kitti360'",
+        ),
+        ("kitti360", 0, None, "^0 jobs"),
+        ("kitti360", 1, 100, "sequence 100"),
+    ],
 )
 def test_invalid_arguments_are_refused(
-    tmp_path: Path, town: Town, layout: str, jobs: int, sequence: int | None
+    tmp_path: Path,
+    town: Town,
+    layout: str,
+    jobs: int,
+    sequence: int | None,
+    message: str,
 ) -> None:
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError, match=message):
         export_town(town, tmp_path / "out", layout, jobs=jobs, sequence=sequence)
     assert not (tmp_path / "out").exists()
 

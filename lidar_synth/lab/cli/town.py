@@ -14,7 +14,10 @@ def town(
         int, Option(help="seed of the town: another seed is another town")
     ] = 0,
     layout: Annotated[
-        str, Option(help="folder layout: kitti360 | semantic_kitti | kitti")
+        str,
+        Option(
+            help="folder layout: kitti360 | semantic_kitti | kitti (or kitti_object)"
+        ),
     ] = "kitti360",
     sensor: Annotated[
         str, Option(help="sensor that casts the rays: a preset or a YAML file")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lidar_synth.errors import ConfigError, suggest
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.files.claims import claim, hold_writing
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.markdown import escape_markdown
@@ -42,14 +42,14 @@ SETTINGS = "town.json"
 _README = """# Synthetic street scans
 
 These scans are **synthetic**: rays cast into a procedural town by `lidar-synth town` (package
-lidar_synth). They are not KITTI-360, SemanticKITTI or KITTI, and contain nothing of them; only the
-layout of the files is theirs, so that the same readers and trainers take them.
+lidar_synth). They are not KITTI-360, SemanticKITTI or KITTI; only the layout of the files is
+theirs, so that the same readers and trainers take them.
 
 - layout: {layout}; sensor: {sensor}; seed: {seed}; {interval} s between neighbouring scans
 - {frames} neighbouring scans share a stretch of road; instance numbers count within a stretch, and
   stretches lie at least 1 km apart in the poses
-- `{settings}` holds the settings; `lidar-synth town` with the same settings resumes an interrupted
-  run
+{skin}- `{settings}` holds the settings; `lidar-synth town` with the same settings resumes an
+  interrupted run
 """
 
 
@@ -69,7 +69,7 @@ def export_town(
     Args:
         town: the town to export.
         out: the folder to write to.
-        layout: one of ``LAYOUTS``.
+        layout: one of ``LAYOUTS``; ``kitti_object`` is another name of ``kitti``.
         sequence: number of the drive or sequence to write, 0 to 99; ``SEQUENCES`` by default.
         camera: whether to render and write the camera image of each scan.
         accumulate: whether to write accumulated clouds beside the scans of layout ``kitti360``, see
@@ -85,13 +85,11 @@ def export_town(
             another layout or of too many scans, or a folder that holds another town.
         FileError: if the output cannot be written.
     """
-    if layout not in LAYOUTS or jobs < 1:
-        expected = f"one of {', '.join(LAYOUTS)}, and at least 1 job"
-        raise ConfigError(
-            f"layout {layout!r}, {jobs} jobs",
-            expected,
-            suggest(layout, set(LAYOUTS) - {layout}),
-        )
+    if layout == "kitti_object":
+        layout = "kitti"
+    choose("layout", layout, LAYOUTS)
+    if jobs < 1:
+        raise ConfigError(f"{jobs} jobs", "at least 1")
     number = SEQUENCES.get(layout, 0) if sequence is None else sequence
     if not 0 <= number < 100:
         raise ConfigError(f"sequence {number}", "0 to 99")
@@ -155,7 +153,15 @@ def _claim_folder(
             "sensor": escape_markdown(town.sensor.name),
             "frames": STRETCH_FRAMES,
             "settings": SETTINGS,
+            "skin": "",
         }
+        if town.skin is not None:
+            facts = town.skin.provenance
+            source = escape_markdown(facts.get("source", "recorded scans"))
+            names["skin"] = (
+                f"- the look of their returns (skin) was learnt from {source}; licence: "
+                f"{escape_markdown(facts['licence'])}\n"
+            )
         text = _README.format(**settings | names)
         write_file(out / "README.md", text.encode())
 
