@@ -372,3 +372,11 @@ def test_options_of_the_other_task_are_refused(
     assert isinstance(result.exception, ConfigError)
     message = str(result.exception)
     assert option in message and "Did you mean" not in message
+
+
+@pytest.mark.parametrize("task", ["segmentation", "detection"])
+def test_scans_that_may_be_skipped_are_not_compared(task: str, places: Path) -> None:
+    """A skipped scan would be replaced by one of another place."""
+    given = ["--task", task, "--places", "drive", "--on-bad", "skip", "--dry-run"]
+    with pytest.raises(ConfigError, match="convert IN OUT --to FORMAT --on-bad skip"):
+        app(["prove", str(places), *given], standalone_mode=False)

@@ -139,6 +139,21 @@ def find_places(
     return dict(sorted(places.items()))
 
 
+def refuse_skipping(source: Source) -> None:
+    """Refuse to compare with ``on_bad="skip"``: in the place of a scan that cannot be read would
+    stand the next one, which may be of another place.
+
+    Raises:
+        ConfigError: on a source that skips.
+    """
+    if getattr(source, "on_bad", "") == "skip":
+        raise ConfigError(
+            "a comparison with on_bad='skip'",
+            "scans that can all be read",
+            "First type lidar-synth convert IN OUT --to FORMAT --on-bad skip.",
+        )
+
+
 def _with_labels(source: Source, places: Places) -> Places:
     kept = {n: p for n, p in places.items() if source[p[0]].label is not None}
     if 0 < len(kept) < len(places):

@@ -24,6 +24,7 @@ from lidar_synth.lab.proof.places import (
     choose,
     find_places,
     names_of,
+    refuse_skipping,
 )
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.scores import GROUPS, groups_of, require_labels
@@ -59,11 +60,14 @@ def make_plan(
 
     Raises:
         ConfigError: on settings that do not fit the scans or the sensor, too short a time, a device
-            that is not there, or tests of another sensor or of scans that are trained on.
+            that is not there, scans with ``on_bad="skip"``, or tests of another sensor or of scans
+            that are trained on.
         DataError: on one place only, on scans without labels, or on a class that nothing is
             labelled as.
     """
     check_device(device)
+    refuse_skipping(source)
+    refuse_skipping(tests or [])
     arms = rows(settings.arms, settings.ratios)
     groups = groups_of(_classes(source, settings.classes), settings.only)
     sensor = coarser(sensor_of(source), settings.beams)

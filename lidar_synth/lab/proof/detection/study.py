@@ -44,7 +44,13 @@ from lidar_synth.lab.proof.detection.scores import Truth
 from lidar_synth.lab.proof.detection.summary import summarise
 from lidar_synth.lab.proof.machine import command_line, machine
 from lidar_synth.lab.proof.page import write_body
-from lidar_synth.lab.proof.places import Places, choose, find_places, names_of
+from lidar_synth.lab.proof.places import (
+    Places,
+    choose,
+    find_places,
+    names_of,
+    refuse_skipping,
+)
 from lidar_synth.lab.proof.plan import count_scans
 from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels import ObjectBank
@@ -101,7 +107,9 @@ class DetectionSettings:
 
 
 def with_boxes(source: Source) -> Source:
-    """A source as detectors learn from it: of KITTI, the scans with boxes, in the camera's view."""
+    """A source as detectors learn from it: of KITTI, the scans with boxes, in the camera's view;
+    raises as ``refuse_skipping``."""
+    refuse_skipping(source)
     return source.with_boxes() if isinstance(source, CameraBoxes) else source
 
 
