@@ -113,7 +113,7 @@ def test_released_weights_take_the_place_of_a_training(
     assert len(OWN.findall(text)) == 3
     home = out / "tiny"
     assert not (home / "kitti360_teacher").exists()
-    imported = home / "imported" / "released.safetensors"
+    [imported] = (home / "imported").iterdir()
     _, digest = read_header(imported)
     header, _ = read_header(home / "kitti360_student" / "kitti360_student.safetensors")
     assert header.provenance["teacher"] == digest
@@ -127,6 +127,18 @@ def test_released_weights_take_the_place_of_a_training(
     save_checkpoint(imported, other, made.networks)
     with pytest.raises(ConfigError, match="which was made from another teacher than"):
         call(*again, use)
+
+
+def test_two_released_files_may_have_one_name(tmp_path: Path) -> None:
+    found = set()
+    for scale in (1, 2):
+        weights = {name: scale * value for name, value in peer_weights().items()}
+        given = {"teacher": tmp_path / str(scale) / "r2flow.pth"}
+        given["teacher"].parent.mkdir()
+        write_r2flow(given["teacher"], weights)
+        made = TaskRun("pixel", tmp_path, given=given).checkpoint("teacher")
+        found.add(read_header(made)[0].provenance["file_sha256"])
+    assert len(found) == 2
 
 
 @pytest.mark.slow

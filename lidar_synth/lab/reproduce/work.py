@@ -14,12 +14,14 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from lidar_synth.bake.conditions import conditions, conditions_for
 from lidar_synth.cli.sample import sample
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.disk import sha256
 from lidar_synth.files.recipes import folder as recipes_folder
 from lidar_synth.files.recipes import merge
 from lidar_synth.formats import open_scans
@@ -45,6 +47,8 @@ PEERS = {".pth": "r2flow", ".ckpt": "lidm"}
 SENSOR = recipes_folder() / "tiny_sensor.yaml"
 TINY = {"kitti360": (4, 3), "semantic_kitti": (0, 8)}
 """Drives of the town that is written for ``tiny``: trained on, compared with."""
+
+_hash = lru_cache(sha256)
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,9 @@ class TaskRun:
         path = self.given[stage]
         if path.suffix not in PEERS:
             return path
-        out = self.folder / "imported" / f"{path.stem}.safetensors"
+        # two files may have one name
+        name = f"{path.stem}-{_hash(path)[:12]}.safetensors"
+        out = self.folder / "imported" / name
         if not out.exists():
             out.parent.mkdir(parents=True, exist_ok=True)
             save_checkpoint(out, *IMPORTERS[PEERS[path.suffix]](path))
