@@ -29,6 +29,12 @@ def test_a_setting_that_is_not_recorded_was_none(path: Path) -> None:
         claim(path, {"seed": 4, "objects": "cast"})
 
 
+def test_a_setting_that_is_no_longer_given_is_refused(path: Path) -> None:
+    claim(path, {**SETTINGS, "reflectance_max": 255.0})
+    with pytest.raises(ConfigError, match="255.0}; expected {'reflectance_max': None}"):
+        claim(path, SETTINGS)
+
+
 def test_another_value_is_refused(path: Path) -> None:
     claim(path, SETTINGS)
     with pytest.raises(ConfigError, match="was filled with {'seed': 4}"):

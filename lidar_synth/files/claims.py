@@ -51,7 +51,7 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
 
 def compare(text: str, wanted: dict[str, Any], folder: str | Path, name: str) -> None:
     """Refuse a folder, or a URL, whose file ``name`` records other settings; raises as
-    ``claim``. A setting that it does not record was None."""
+    ``claim``. A setting that it does not record, or that is not wanted, is None."""
     existing = parse_json(
         text,
         f"{folder}/{name}, which is damaged,",
@@ -62,12 +62,13 @@ def compare(text: str, wanted: dict[str, Any], folder: str | Path, name: str) ->
             f"{folder}/{name} is damaged (it holds {type(existing).__name__})",
             hint="Choose another output folder.",
         )
-    recorded = {name: existing.get(name) for name in wanted}
-    other = {n: v for n, v in recorded.items() if v != wanted[n]}
+    keys = {**wanted, **existing}
+    other = [key for key in keys if existing.get(key) != wanted.get(key)]
     if other:
+        before, now = ({k: each.get(k) for k in other} for each in (existing, wanted))
         raise ConfigError(
-            f"{folder} was filled with {_SHORT.repr(other)}",
-            _SHORT.repr({name: wanted[name] for name in other}),
+            f"{folder} was filled with {_SHORT.repr(before)}",
+            _SHORT.repr(now),
             "Use the same options to resume, or choose another folder.",
         )
 
