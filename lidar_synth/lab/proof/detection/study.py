@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
-from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.files.claims import claim
