@@ -233,6 +233,14 @@ def test_a_damaged_finished_shard_is_regenerated(
     assert files(plan.out) == expected
 
 
+def test_a_finished_bake_writes_nothing_again(plan: BakePlan) -> None:
+    """So that it may be on a disk that can only be read."""
+    bake(plan, progress=False)
+    there = {path: path.stat().st_ino for path in plan.out.iterdir()}
+    bake(plan, progress=False)
+    assert {path: path.stat().st_ino for path in plan.out.iterdir()} == there
+
+
 def test_temporary_files_of_killed_processes_are_removed(
     plan: BakePlan, expected: dict[str, bytes]
 ) -> None:

@@ -239,16 +239,12 @@ def write_bank_files(root: str | Path, index: Index, baked: bool = False) -> Ind
     files = card_files(title, index)
     if baked:
         files[SETTINGS] = _settings_file(folder, index)
-    for name, content in files.items():
-        if not _holds(folder, name, content):  # others may hold a lock on it
+    hashes = {name: hashlib.sha256(held).hexdigest() for name, held in files.items()}
+    index = replace(index, files=hashes)
+    for name, content in [*files.items(), (INDEX, index.to_json())]:
+        # others may hold a lock on it, or the disk may be read-only
+        if not _holds(folder, name, content):
             folder.write(name, content)
-    index = replace(
-        index,
-        files={
-            name: hashlib.sha256(content).hexdigest() for name, content in files.items()
-        },
-    )
-    folder.write(INDEX, index.to_json())
     return index
 
 
