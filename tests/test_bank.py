@@ -310,6 +310,13 @@ def test_a_bank_without_reflectance_warns(tmp_path: Path) -> None:
     assert not scans[0].reflectance.any()
 
 
+@pytest.mark.parametrize("number", [slice(3), [1, 2], None, 1.0])
+def test_a_scan_has_a_whole_number(root: Path, number: Any) -> None:
+    for scans in (Bank(root), open_scans(root)):
+        with pytest.raises(TypeError, match="scan .*; expected a whole number"):
+            scans[number]
+
+
 def test_a_paged_bank_reads_over_a_network(tmp_path: Path) -> None:
     import fsspec
 

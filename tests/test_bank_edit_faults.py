@@ -6,10 +6,11 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from banks import some_image, write_bank
+from banks import SENSOR, some_image, write_bank
 
 from lidar_synth.bake import edit
 from lidar_synth.bake.edit import drop, head, merge, split
@@ -97,6 +98,15 @@ def test_a_file_of_the_user_is_not_replaced(bank: Bank, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="holds a README.md"):
         head(bank, 3, tmp_path / "out", progress=False)
     assert contents(tmp_path / "out") == {"README.md": b"mine"}
+
+
+def test_what_cannot_be_merged_is_named(bank: Bank, tmp_path: Path) -> None:
+    wide = replace(SENSOR, columns=2 * SENSOR.columns)
+    write_bank(tmp_path / "wide", [some_image(0, wide)])
+    with pytest.raises(ConfigError, match=r"\(8 x 64, .*expected .*\(8 x 32, "):
+        merge([bank, Bank(tmp_path / "wide")], tmp_path / "out")
+    with pytest.raises(ConfigError, match="no bank to merge"):
+        merge([], tmp_path / "out")
 
 
 def test_a_refused_split_leaves_no_claim(bank: Bank, tmp_path: Path) -> None:

@@ -36,16 +36,18 @@ def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
         progress: show a bar.
 
     Raises:
-        ConfigError: on banks with different sensors or fields, banks that share scans, or a folder
-            that holds something else.
+        ConfigError: without a bank, on banks with different sensors or fields, banks that share
+            scans, or a folder that holds something else.
         FileError: if it cannot be written.
     """
+    if not banks:
+        raise ConfigError("no bank to merge", "at least one")
     first = banks[0].facts
     for bank in banks[1:]:
         if (bank.facts.sensor, bank.facts.fields) != (first.sensor, first.fields):
             raise ConfigError(
-                f"{bank.root} holds {bank.facts.fields} of sensor {bank.sensor.name!r}",
-                f"{first.fields} of sensor {first.sensor.name!r}, as {banks[0].root}",
+                f"{bank.root} holds {bank.facts.fields} of sensor {bank.sensor.grid_text()}",
+                f"{first.fields} of sensor {first.sensor.grid_text()}, as {banks[0].root}",
             )
     _check_disjoint(banks)
     with _making(out, "merge", banks) as complete:

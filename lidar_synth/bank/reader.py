@@ -22,6 +22,7 @@ from lidar_synth.geometry import (
     RangeImage,
     Scan,
     Sensor,
+    index_of,
     model_provenance,
 )
 from lidar_synth.geometry.projection import unproject
@@ -322,11 +323,9 @@ def _place(index: Index, number: int) -> tuple[int, int]:
     """The shard of a scan, and its position in that shard.
 
     Raises:
-        IndexError: unless -len <= number < len.
+        TypeError, IndexError: as ``index_of``.
     """
-    if not -index.scans <= number < index.scans:
-        raise IndexError(f"scan {number} of {index.scans}")
-    number %= index.scans
+    number = index_of(number, index.scans)
     shard = bisect_right(index.ends, number)
     entry = index.shards[shard]
     return shard, entry.position(number - (index.ends[shard] - entry.kept))

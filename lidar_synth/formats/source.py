@@ -12,7 +12,7 @@ from lidar_synth.errors import ConfigError, DataError, FileError, suggest
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import FORMAT, NAME, read_description
 from lidar_synth.formats.points import bad_points_kept, drop_bad_points
-from lidar_synth.geometry import Scan, Sensor, load_sensor
+from lidar_synth.geometry import Scan, Sensor, index_of, load_sensor
 from lidar_synth.geometry.agreement import MOST_OUTSIDE, agreement
 
 OnBad = Literal["error", "skip", "drop-points"]
@@ -202,10 +202,9 @@ class ScanFiles(ABC):
         )
 
     def __getitem__(self, index: int) -> Scan:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"scan {index} of {len(self)}")
+        index = index_of(index, len(self))
         if self.on_bad != "skip":
-            return self.load(index % len(self))
+            return self.load(index)
         for step in range(len(self)):
             scan = self.load_or_skip((index + step) % len(self))
             if scan is not None:

@@ -5,6 +5,7 @@ All of them are in the sensor frame: right-handed, x forward, y left, z up, metr
 """
 
 import hashlib
+import operator
 from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -419,6 +420,23 @@ def check_source(source: Any, hint: str = "") -> None:
             "a map-style dataset, with __len__ and __getitem__",
             f"open_scans(path) opens a folder, load_generator('town') a model.{hint}",
         )
+
+
+def index_of(number: Any, length: int) -> int:
+    """The index, 0 <= index < length, of a scan whose number may count from the end.
+
+    Raises:
+        TypeError: on anything but a whole number.
+        IndexError: unless -length <= number < length.
+    """
+    try:
+        index = operator.index(number)
+    except TypeError:
+        given = f"scan {number!r}; expected a whole number"
+        raise TypeError(f"{given}. Several: [scans[i] for i in range(3)]") from None
+    if not -length <= index < length:
+        raise IndexError(f"scan {index} of {length}")
+    return index % length
 
 
 def spread(indices: Sequence[int], count: int) -> list[int]:
