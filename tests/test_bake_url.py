@@ -572,11 +572,17 @@ def test_a_web_server_cannot_be_baked_into(model: Path, tmp_path: Path) -> None:
         bake(plan_at(f"{served.url}/bank", model), progress=False)
 
 
-def test_a_bank_on_a_web_server_is_verified(tmp_path: Path) -> None:
+def test_a_bank_on_a_web_server_is_verified(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retries, "WAITS", ())
     [*_, last] = write_bank(tmp_path / "bank", [some_image(i) for i in range(4)])
     with serve(tmp_path) as served:
         assert verify(f"{served.url}/bank", progress=False) == []
         last.write_bytes(last.read_bytes()[:-5])
         [problem, *_] = verify(f"{served.url}/bank", progress=False)
-    assert problem.file == last.name
+        served.broken.add("bank")  # its listing
+        with pytest.warns(UserWarning, match="not in the index were not looked for"):
+            [again, *_] = verify(f"{served.url}/bank", progress=False)
+    assert problem.file == again.file == last.name
     assert hashlib.sha256(last.read_bytes()).hexdigest()[:12] in problem.what

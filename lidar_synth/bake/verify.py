@@ -1,6 +1,7 @@
 """Verification of banks: whether all files are intact, and whether the scans match their seeds."""
 
 import hashlib
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -50,7 +51,8 @@ class Problem(NamedTuple):
 def verify(root: str | Path, progress: bool = True) -> list[Problem]:
     """Check every shard's presence, size and hash, its attributes against the index, and the CRC of
     every scan; then the hashes of the card and the other files that the index lists (indices of
-    older versions list none).
+    older versions list none). A server that lists no files is warned about: there may be other
+    shards.
 
     Args:
         root: the bank's folder or URL.
@@ -66,6 +68,14 @@ def verify(root: str | Path, progress: bool = True) -> list[Problem]:
     folder = open_folder(root)
     index = read_index(bank_root(root))
     problems: list[Problem] = []
+    listed: set[str] = set()
+    try:
+        listed.update(filter(SHARD.fullmatch, folder.sizes()))
+    except FileError as error:
+        warnings.warn(
+            f"{error}. Shards that are not in the index were not looked for.",
+            stacklevel=2,
+        )
     with tqdm(
         total=sum(entry.scans for entry in index.shards),
         desc="verify",
@@ -75,10 +85,9 @@ def verify(root: str | Path, progress: bool = True) -> list[Problem]:
         for entry in index.shards:
             problems += check_shard(folder, index.sources[entry.source], entry)
             bar.update(entry.scans)
-    shards = set(filter(SHARD.fullmatch, folder.sizes()))
     return [
         *problems,
-        *(Problem(name, UNLISTED) for name in sorted(shards - index.by_file.keys())),
+        *(Problem(name, UNLISTED) for name in sorted(listed - index.by_file.keys())),
         *check_side_files(folder, index),
     ]
 
