@@ -6,6 +6,7 @@ import multiprocessing
 import pickle
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -198,10 +199,23 @@ def test_few_files_are_open_and_each_shard_is_parsed_once(
     for i in (0, 4, 1, 3, 2):
         assert bank[i].id == f"small/5/{i}"
         files = [shard._file for shard in bank._shards.values()]
-        assert sum(file._descriptor >= 0 for file in files) == 1  # type: ignore[attr-defined]
+        assert sum(file._opened is not None for file in files) == 1  # type: ignore[attr-defined]
     assert bank.shard(0) is first
     bank.close()
     assert bank[2].id == "small/5/2"
+
+
+def test_threads_read_what_others_have_closed(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "_OPEN", 1)
+    bank = Bank(root)
+    first = bank.shard(0)
+    assert len(bank[4])  # closes it
+    assert np.array_equal(first.read(0)["range"], bank.shard(0).read(0)["range"])
+    with ThreadPoolExecutor(4) as pool:
+        names = list(pool.map(lambda i: bank[i % 5].id, range(60)))
+    assert names == [f"small/5/{i % 5}" for i in range(60)]
 
 
 def test_memory_for_the_places_of_scans_is_bounded(

@@ -6,6 +6,7 @@ import weakref
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
@@ -287,7 +288,8 @@ def _open_cache(
 
 def _touch(shards: OrderedDict[int, ShardReader], number: int, most: int) -> None:
     """Make a shard the latest, and close the oldest one if there are more than ``most``."""
-    shards.move_to_end(number)
+    with suppress(KeyError):  # another thread has closed it
+        shards.move_to_end(number)
     if len(shards) > most:
         shards.popitem(last=False)[1].close()
 

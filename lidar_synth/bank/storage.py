@@ -59,8 +59,23 @@ class Storage(Protocol):
         ...
 
 
+class _Opened:
+    """An open file, closed when nothing refers to it any more: a thread may still read it when
+    another one closes its ``LocalFile``."""
+
+    def __init__(self, path: Path) -> None:
+        refuse_special(path)
+        self.descriptor = os.open(path, os.O_RDONLY)
+        found = os.fstat(self.descriptor)
+        self.state = found.st_size, found.st_mtime_ns, found.st_ino
+
+    def __del__(self) -> None:
+        with suppress(OSError, AttributeError):
+            os.close(self.descriptor)
+
+
 class LocalFile:
-    """A file on this machine; see ``Storage``.
+    """A file on this machine; see ``Storage``. A closed one is opened for each ``read``.
 
     Raises:
         FileError: if it cannot be opened.
@@ -70,8 +85,9 @@ class LocalFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._descriptor = -1
-        self._state = self._open()
+        opened = self._open()
+        self._opened: _Opened | None = opened
+        self._state = opened.state
         self.size = self._state[0]
 
     def reopen(self) -> bool:
@@ -81,16 +97,21 @@ class LocalFile:
         Raises:
             FileError: if it cannot be opened.
         """
-        return self._descriptor >= 0 or self._open() == self._state
+        if self._opened is None and (opened := self._open()).state == self._state:
+            self._opened = opened
+        return self._opened is not None
 
     def read(self, offset: int, size: int) -> bytes:
         if offset + size > self.size:
             raise DataError(
                 f"{self._path} ends before byte {offset + size}", "a complete file"
             )
+        opened = self._opened or self._open()
+        if opened.state != self._state:
+            raise DataError(f"{self._path} has changed", "the file that was opened")
         with reading(self._path, "a file of a bank"):
             if hasattr(os, "pread"):
-                content = os.pread(self._descriptor, size, offset)
+                content = os.pread(opened.descriptor, size, offset)
             else:  # on Windows, where no other file can take the place of an open one
                 with self._path.open("rb") as file:
                     file.seek(offset)
@@ -102,19 +123,11 @@ class LocalFile:
         return content
 
     def close(self) -> None:
-        with suppress(OSError):
-            os.close(self._descriptor)
-        self._descriptor = -1
+        self._opened = None
 
-    __del__ = close
-
-    def _open(self) -> tuple[int, int, int]:
-        """Size, time of change and number of the file, which is open then."""
+    def _open(self) -> _Opened:
         with reading(self._path, "a file of a bank"):
-            refuse_special(self._path)
-            self._descriptor = os.open(self._path, os.O_RDONLY)
-            found = os.fstat(self._descriptor)
-        return found.st_size, found.st_mtime_ns, found.st_ino
+            return _Opened(self._path)
 
 
 class RemoteFile:
