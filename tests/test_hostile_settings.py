@@ -139,6 +139,14 @@ def test_yaml_that_is_not_text_is_refused(tmp_path: Path) -> None:
     open_yaml(path)
 
 
+def test_a_key_that_stands_twice_is_refused() -> None:
+    for text in ("seed: 1\nsteps: 2\nseed: 3", "a: {seed: 1, 'seed': 3}"):
+        with pytest.raises(ConfigError, match="the key 'seed' stands twice"):
+            parse_yaml(text, "here")
+    merged = "{a: {c: &c {<<: {x: 1}, x: 2}}, b: {<<: *c}}"
+    assert parse_yaml(merged, "here")["b"] == {"x": 2}
+
+
 def test_anchors_in_reason_stay_possible() -> None:
     assert parse_yaml(laughs(3), "here")["a2"][8][8] == [1, 1]
     assert parse_yaml("a: &a {x: 1}\nb: {<<: *a, y: 2}", "here")["b"] == {

@@ -13,6 +13,7 @@ import tarfile
 import warnings
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from io import BytesIO
@@ -24,7 +25,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, shorten
 from lidar_synth.files.disk import SKIP_HINT, STRAY, open_file, read_file, read_text
 
 if TYPE_CHECKING:
@@ -151,15 +152,28 @@ def read_yaml(path: Path, expected: str) -> Any:
     return parse_yaml(read_text(path, expected, LONGEST_YAML), str(path))
 
 
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that stands twice, instead of taking the last one."""
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        keys = Counter((key.tag, str(key.value)) for key, _ in node.value)
+        for (_, key), count in keys.most_common(1):
+            if count > 1:
+                raise yaml.YAMLError(f"the key {shorten(key, 100)!r} stands twice")
+        return node
+
+
 def parse_yaml(text: str, where: str) -> Any:
     """Parse the plain values of a YAML text.
 
     Raises:
-        ConfigError: if it is not YAML, has tags, or exceeds the limits on values and levels.
+        ConfigError: if it is not YAML, has tags or a key twice, or exceeds the limits on values and
+            levels.
     """
     try:
         fault = _yaml_fault(yaml.parse(text, Loader=yaml.SafeLoader))
-        values = None if fault else yaml.safe_load(text)
+        values = None if fault else yaml.load(text, _Loader)
     # a date such as 2001-99-99 is a ValueError
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         raise ConfigError(
