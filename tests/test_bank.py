@@ -316,6 +316,12 @@ def test_a_bank_can_be_opened_and_converted_like_any_source(
         assert np.array_equal(a.points, b.points) and np.array_equal(a.label, b.label)
 
 
+def test_a_bank_that_was_begun_is_none_yet(tmp_path: Path) -> None:
+    (tmp_path / ".bake.json").write_text("{}")
+    with pytest.raises(FileError, match="holds no bank: index.json .*resume it"):
+        open_scans(tmp_path)
+
+
 def test_a_bank_without_reflectance_warns(tmp_path: Path) -> None:
     """Not: scans of constant reflectance, which a network would learn."""
     write_bank(tmp_path, [some_image()], fields=("label",))
