@@ -430,7 +430,10 @@ def test_every_setting_is_an_option_with_its_description_and_default(
     ("change", "message"),
     [
         ({"seed": 5}, r"'seed': 4.*'seed': 5"),
-        ({"count": 11}, r"'count': 10.*'count': 11"),
+        (
+            {"count": 16},
+            r"'count': 10.*'count': 16.*--first 10 --count 6, then .*merge",
+        ),
         ({"steps": 2}, r"'steps': None.*'steps': 2"),
         (
             {"fields": ("label",)},

@@ -72,11 +72,18 @@ def check_settings(plan: BakePlan) -> BakePlan:
         refuse_others(plan.out)
         return plan
     text = open_folder(plan.out).read(SETTINGS).decode(errors="replace")
+    hint = ""
     with suppress(ValueError, LookupError, TypeError, RecursionError):
         recorded = json.loads(text)
+        more = plan.job.count - recorded["count"]
+        if recorded["first"] == plan.job.first and more > 0:
+            hint = (
+                " To add scans, bake another bank with --first "
+                f"{plan.job.first + recorded['count']} --count {more}, then lidar-synth bank merge."
+            )
         if plan.settings["condition_content"] == recorded["condition_content"]:
             plan = _with_conditions_at(plan, recorded["condition"])
-    compare(text, json.loads(json.dumps(plan.settings)), plan.out, SETTINGS)
+    compare(text, json.loads(json.dumps(plan.settings)), plan.out, SETTINGS, hint)
     return plan
 
 

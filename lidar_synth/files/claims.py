@@ -49,9 +49,12 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
     compare(read_text(path), wanted, path.parent, path.name)
 
 
-def compare(text: str, wanted: dict[str, Any], folder: str | Path, name: str) -> None:
+def compare(
+    text: str, wanted: dict[str, Any], folder: str | Path, name: str, hint: str = ""
+) -> None:
     """Refuse a folder, or a URL, whose file ``name`` records other settings; raises as
-    ``claim``. A setting that it does not record, or that is not wanted, is None."""
+    ``claim``. A setting that it does not record, or that is not wanted, is None. The error ends
+    with ``hint``."""
     existing = parse_json(
         text,
         f"{folder}/{name}, which is damaged,",
@@ -69,7 +72,7 @@ def compare(text: str, wanted: dict[str, Any], folder: str | Path, name: str) ->
         raise ConfigError(
             f"{folder} was filled with {_SHORT.repr(before)}",
             _SHORT.repr(now),
-            "Use the same options to resume, or choose another folder.",
+            f"Use the same options to resume, or choose another folder.{hint}",
         )
 
 
