@@ -96,7 +96,7 @@ class BakeJob(Drawing):
     fields: tuple[str, ...] | None = Field(
         None,
         description=(
-            "what to store beside the range: reflectance,label,confidence [all that the model "
+            "what to store beside the range: reflectance,label,confidence,instance,boxes [all that the model "
             "generates]"
         ),
     )
