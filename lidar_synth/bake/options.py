@@ -96,8 +96,8 @@ class BakeJob(Drawing):
     fields: tuple[str, ...] | None = Field(
         None,
         description=(
-            "what to store beside the range: reflectance,label,confidence,instance,boxes [all that the model "
-            "generates]"
+            "what to store beside the range: reflectance,label,confidence,instance,boxes "
+            "[all that the model generates]"
         ),
     )
     device: Literal["cpu", "cuda"] = Field(
