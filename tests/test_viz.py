@@ -382,6 +382,17 @@ def test_values_that_are_none_are_refused(
         write_view(tmp_path / f"out.{suffix}", [scan, wrong])
 
 
+@pytest.mark.parametrize("suffix", ["PNG", "html"])
+def test_labels_that_are_no_classes_are_refused(suffix: str, tmp_path: Path) -> None:
+    scan = random_scan(SMALL)
+    wrong = replace(scan, label=np.full(len(scan), 77, np.uint8))
+    for shown in (wrong, project(wrong, channels=["label"])):
+        with pytest.raises(DataError, match=r"labels \[77\]; expected train ids"):
+            write_view(tmp_path / f"out.{suffix}", [scan, shown])
+    write_view(tmp_path / f"out.{suffix}", [scan])
+    assert (tmp_path / f"out.{suffix}").is_file()
+
+
 def test_invalid_paths_and_empty_lists_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError, match=r"out\.jpg; expected a file that ends in \.png or \.html"

@@ -53,6 +53,20 @@ GROUND = np.isin(
 """(256,) whether a label, uint8, is of the ground."""
 
 
+def check_labels(labels: NDArray[np.integer], where: str) -> None:
+    """Refuse labels that are not train ids, with ``where`` before the message.
+
+    Raises:
+        DataError: on one.
+    """
+    known = (labels >= 0) & (labels < len(NAMES)) | (labels == IGNORE)
+    if not known.all():
+        raise DataError(
+            f"{where}: labels {np.unique(labels[~known])[:8].tolist()}",
+            "train ids 0..18, or 255 = ignore",
+        )
+
+
 def has_ground(label: NDArray[np.uint8] | None) -> TypeGuard[NDArray[np.uint8]]:
     """Whether any of the labels (N,) is of the ground; those of objects that were pasted into an
     unlabelled scan do not tell where its ground is."""

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, check_labels
 from lidar_synth.errors import DataError, LidarSynthError, shorten
 from lidar_synth.files.disk import SKIP_HINT, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
@@ -233,11 +233,8 @@ def _check_channel(name: str, values: NDArray[Any], where: str) -> None:
         raise DataError(
             f"{where}: {name} from {values.min()} to {values.max()}", "0 to 1"
         )
-    if name == "label" and not ((values < len(NAMES)) | (values == IGNORE)).all():
-        raise DataError(
-            f"{where}: labels {np.unique(values)[-8:].tolist()}",
-            "train ids 0..18, or 255 = ignore",
-        )
+    if name == "label":
+        check_labels(values, where)
 
 
 def check_numbers(array: NDArray[Any], where: str) -> None:

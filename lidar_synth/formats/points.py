@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import check_labels
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import SKIP_HINT, reading, refuse_special, write_file
 from lidar_synth.formats.calibration import check_rigid
@@ -188,14 +188,8 @@ def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
             1], times beyond ``LONGEST``, and a pose that is not rigid.
     """
     check_points(scan.points, scan.reflectance, where, reflectance_max)
-    if (
-        scan.label is not None
-        and ((scan.label >= len(NAMES)) & (scan.label != IGNORE)).any()
-    ):
-        raise DataError(
-            f"{where}: labels {np.unique(scan.label)[-8:].tolist()}",
-            "train ids 0..18, or 255 = ignore",
-        )
+    if scan.label is not None:
+        check_labels(scan.label, where)
     if (
         scan.confidence is not None
         and not ((scan.confidence >= 0) & (scan.confidence <= 1)).all()

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 from typing_extensions import Self
 
-from lidar_synth.datasets.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import check_labels
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
@@ -135,11 +135,7 @@ class ObjectBank:
                 f"objects: reflectance {self.reflectance.min()} to {self.reflectance.max()}",
                 "0 to 1",
             )
-        if ((self.label >= len(NAMES)) & (self.label != IGNORE)).any():
-            raise DataError(
-                f"objects: labels up to {self.label.max()}",
-                "train ids 0..18, or 255 = ignore",
-            )
+        check_labels(self.label, "objects")
 
     @classmethod
     def from_scans(

@@ -38,16 +38,17 @@ __all__ = [
 
 
 def view_suffix(path: Path) -> str:
-    """The suffix of a path, if ``write_view`` can write such a file.
+    """The suffix of a path in small letters, if ``write_view`` can write such a file.
 
     Raises:
         ConfigError: on any other suffix than .png and .html.
     """
-    if path.suffix not in (".png", ".html"):
+    suffix = path.suffix.lower()
+    if suffix not in (".png", ".html"):
         raise ConfigError(
             f"cannot write a view to {path}", "a file that ends in .png or .html"
         )
-    return path.suffix
+    return suffix
 
 
 def write_view(
@@ -68,7 +69,8 @@ def write_view(
 
     Raises:
         ConfigError: on another suffix, or without scans.
-        DataError: on points that are NaN or infinite, or another reflectance than 0 to 1.
+        DataError: on points that are NaN or infinite, another reflectance than 0 to 1, or labels
+            that are not train ids.
         FileError: if the file cannot be written.
 
     Example:

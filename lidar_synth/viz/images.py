@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES, check_labels
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.geometry import RangeImage, Scan, require_finite, require_reflectance
 from lidar_synth.geometry.projection import project, unproject
@@ -43,7 +43,8 @@ def views(given: Sequence[Scan | RangeImage]) -> list[View]:
 
     Raises:
         ConfigError: without scans.
-        DataError: on points that are NaN or infinite, or another reflectance than 0 to 1.
+        DataError: on points that are NaN or infinite, another reflectance than 0 to 1, or labels
+            that are not train ids.
     """
     if not given:
         raise ConfigError("no scans to show", "at least one scan")
@@ -51,6 +52,8 @@ def views(given: Sequence[Scan | RangeImage]) -> list[View]:
         if isinstance(item, Scan):
             require_finite(item)
             require_reflectance(item)
+        if item.label is not None:
+            check_labels(item.label, f"scan {getattr(item, 'id', '')!r}")
     return [
         View(item, project(item, channels=[n for n in CHANNELS if n in item.fields()]))
         if isinstance(item, Scan)
