@@ -145,6 +145,8 @@ def test_an_image_of_a_layout_tells_no_boxes_and_other_conditions_are_refused(
         generator.scans(0, [0], np.full_like(image, 200))
     with pytest.raises(DataError, match="shape"):
         generator.scans(0, [0], image[:, :4])
+    with pytest.raises(DataError, match="layouts and images of layouts together"):
+        generator.scans(0, [0, 1], [layouts[0], image])
     with pytest.raises(ConfigError, match="a Scan, or a list of them"):
         load_generator("town-semantic").scans(0, [0], layouts[0])
 

@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from lidar_synth.datasets.classes import GROUND
+from lidar_synth.errors import DataError
 from lidar_synth.geometry import Boxes, RangeImage, Scan
 from lidar_synth.geometry.layout import Layout, select_known_boxes
 from lidar_synth.geometry.projection import project, unproject
@@ -35,14 +36,21 @@ def boxes_of(given: Any, count: int) -> list[Boxes] | None:
     Args:
         given: the argument ``condition`` of ``Generator.range_images``.
         count: number of scans.
+
+    Raises:
+        DataError: on layouts and images together.
     """
     if isinstance(given, Mapping):
         given = given.get("layout")
     each = list(given) if isinstance(given, Sequence) else [given] * count
     each = [one.get("layout") if isinstance(one, Mapping) else one for one in each]
-    if not all(
-        isinstance(one, Scan | Layout) and one.boxes is not None for one in each
-    ):
+    known = [isinstance(one, Scan | Layout) and one.boxes is not None for one in each]
+    if any(known) and not all(known):
+        raise DataError(
+            "layouts and images of layouts together",
+            "one kind for all scans: an image does not tell its boxes",
+        )
+    if not all(known):
         return None
     return [
         one.boxes if isinstance(one, Layout) else select_known_boxes(one)
