@@ -81,11 +81,12 @@ class Outline:
             line.ndim != 2
             or line.shape[1] != 2
             or len(line) < 2
+            or (line == line[0]).all()
             or not (np.abs(line) < _FAR).all()
         ):
             raise DataError(
                 f"an outline of shape {line.shape}",
-                "two or more corners x, y in metres",
+                "two or more corners x, y in metres, apart from each other",
             )
         for name in ("low", "high"):
             edge = np.asarray(getattr(self, name), np.float32)
