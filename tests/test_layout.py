@@ -371,7 +371,11 @@ BAD = {
         ConfigError,
         "class 'Dragon'; expected one of 'Car', 'Van'",
     ),
-    "objects: [{class: Car}]": (ConfigError, r"objects\.0\.at: Field required"),
+    "objects: [{class: Car}]": (
+        ConfigError,
+        r"objects\.0\.at: Field required; expected class and at, and maybe heading",
+    ),
+    "objects: [Car]": (ConfigError, r"objects\.0: .* valid dictionary; expected class"),
     "objects: [{class: Car, at: [9, .nan]}]": (ConfigError, r"objects\.0\.at\.1"),
     "objects: [{class: Car, at: [9, 0], colour: red}]": (
         ConfigError,
@@ -383,7 +387,7 @@ BAD = {
     ),
     "outlines: [{kind: sea, line: [[1, 2], [2, 3]], height: 3}]": (
         ConfigError,
-        r"outlines\.0\.kind",
+        r"outlines\.0\.kind: .*; expected kind, line and height",
     ),
     "outlines: [{kind: fence, line: [[1, 2]], height: 3}]": (ConfigError, "at least 2"),
     "outlines: [{kind: fence, line: [[1, 2], [2, 3]], from: 4, height: 3}]": (
@@ -396,6 +400,11 @@ BAD = {
     ),
     "objects: [{class: Car, at: [0.5, 0]}]": (DataError, "around the sensor"),
     "ground: 1": (DataError, r"ground .*expected -10 to -0\.2 m"),
+    "outlines: [{kind: fence, line: [[1, 2], [1, 2]], height: 3}]": (
+        DataError,
+        "corners x, y in metres, apart",
+    ),
+    "": (ConfigError, "its top level: .* valid dictionary; expected ground, reach"),
     "[1, 2]": (ConfigError, "its top level"),
     "a: !!python/object:os.system {}": (ConfigError, "is not YAML of plain values"),
 }

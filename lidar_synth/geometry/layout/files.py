@@ -72,6 +72,14 @@ class _File(_Part):
     outlines: list[_Wall] = []
 
 
+_KEYS = {
+    "": "ground, reach, objects and outlines",
+    "objects": "class and at, and maybe heading, size and above",
+    "outlines": "kind, line and height, and maybe from",
+}
+"""The keys of a file, and those of the entries of its lists."""
+
+
 def load_layout(path: str | Path) -> Layout:
     """Read a layout from a YAML file; the module's docstring shows one.
 
@@ -93,10 +101,11 @@ def load_layout(path: str | Path) -> Layout:
         given = _File.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "its top level"
-        raise ConfigError(
-            f"{path}: {where}: {first['msg']}", "ground, reach, objects and outlines"
-        ) from error
+        place = first["loc"]
+        where = ".".join(map(str, place)) or "its top level"
+        fault = first["msg"].partition(" or instance of")[0]
+        entry = place[0] if len(place) > 1 else ""
+        raise ConfigError(f"{path}: {where}: {fault}", _KEYS[entry]) from error
     rows = [_box(one, given.ground, path) for one in given.objects]
     boxes = Boxes(
         np.array(rows, np.float32).reshape(-1, 7),
