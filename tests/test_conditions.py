@@ -1,6 +1,7 @@
 """Conditions: from users and from real scans, their encoders, training, and invalid input."""
 
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -297,6 +298,12 @@ def test_the_position_embeddings_of_views_and_cells_are_used_and_trained() -> No
             ConfigError,
             r"conditions \['camera'\]; expected 'semantic' among them",
         ),
+        (
+            "layout",
+            "street.yaml",
+            ConfigError,
+            "a condition of type str.* load_layout",
+        ),
         ("semantic", [], ConfigError, "a condition of type list"),
         ("semantic", ["map"] * 3, ConfigError, "a condition of type str"),
         (
@@ -331,6 +338,22 @@ def test_one_condition_for_each_scan_in_every_form(tmp_path: Path) -> None:
     dictionaries = [{"semantic": each} for each in maps]
     for given in (maps, tuple(tensors), dictionaries, [*maps[:2], scan], expected):
         assert torch.equal(batch_of("semantic", given, 3, SENSOR, shape, {}), expected)
+
+
+def test_flipped_and_read_only_arrays_are_taken_as_they_are() -> None:
+    given = np.arange(256, dtype=np.uint8).reshape(SENSOR.shape) % 19
+    given = given[:, ::-1]
+    frozen = given.copy()
+    frozen.setflags(write=False)
+    torch.set_warn_always(True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        taken = [
+            batch_of("semantic", one, 1, SENSOR, SENSOR.shape, {})
+            for one in (given, frozen)
+        ]
+    torch.set_warn_always(False)
+    assert torch.equal(*taken) and np.array_equal(taken[0][0], given)
 
 
 def test_scans_without_the_condition_are_refused(tmp_path: Path) -> None:

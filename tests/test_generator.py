@@ -127,6 +127,8 @@ def test_arguments_that_are_no_numbers_of_scans_are_refused(path: Path) -> None:
     for batch in (0, -1, 2.5):
         with pytest.raises(ConfigError, match=f"batch={batch}; expected a number of"):
             load_generator(path, batch=batch)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"indices=3; expected a list of them, \[3\]"):
+        load_generator(path).scans(0, 3)  # type: ignore[arg-type]
 
 
 def test_steps_and_solver_replace_the_checkpoints_own_grid(
@@ -159,8 +161,9 @@ def test_steps_and_solver_replace_the_checkpoints_own_grid(
             list(generator.samples(0, [0], times=wrong))
     with pytest.raises(ConfigError, match="one of the two"):
         list(generator.samples(0, [0], times=given, steps=2))
-    with pytest.raises(ConfigError, match="0 steps"):
-        generator.scans(0, [0], steps=0)
+    for steps in (0, 2.5):
+        with pytest.raises(ConfigError, match=f"{steps} steps; expected a whole"):
+            generator.scans(0, [0], steps=steps)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="solver 'rk4'"):
         generator.scans(0, [0], solver="rk4")
 
@@ -297,6 +300,9 @@ def test_guidance_interpolates_between_blank_and_given_condition(
         list(replace(guided, batch=2).samples(0, [1, 5], maps, guidance=2.0))
     )
     assert torch.allclose(many[0], more[0], atol=1e-4)
+    for wrong in (float("nan"), -1, 101):
+        with pytest.raises(ConfigError, match=f"guidance {wrong}; expected 0 to 100"):
+            next(guided.samples(0, [1], maps[0], guidance=wrong))
     never = load_generator(write(tmp_path / "never.safetensors", ("range",), 0.0))
     with pytest.raises(
         ConfigError,

@@ -407,7 +407,12 @@ def batch_of(
         raise ConfigError(
             f"a condition of type {type(given).__name__}",
             "an array, a Scan, or a list of them",
+            "load_layout(path) reads a layout." if name == "layout" else "",
         )
+    if isinstance(
+        given, np.ndarray
+    ):  # torch takes no flipped one, and warns of read-only ones
+        given = np.require(given, requirements=["C", "W"])
     values = torch.as_tensor(given)
     if values.is_floating_point() or values.is_complex() or values.dtype == torch.bool:
         raise DataError(f"a {name} condition of {values.dtype}", "whole numbers, uint8")

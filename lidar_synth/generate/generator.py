@@ -237,12 +237,15 @@ class Generator:
 
         Raises:
             ConfigError: on an invalid seed, index, number of steps or solver, a condition for an
-                unconditional model, guidance of a model that was trained without blank conditions,
-                objects that cannot be cast or do not have the layout's classes, or CUDA in a
-                DataLoader worker.
+                unconditional model, guidance outside 0 to 100 or of a model that was trained
+                without blank conditions, objects that cannot be cast or do not have the layout's
+                classes, or CUDA in a DataLoader worker.
+            FileError: if the image of a scan cannot be read.
             DataError: on a condition of another shape or with invalid values, or if a condition is
                 missing.
         """
+        if isinstance(indices, int):
+            raise ConfigError(f"indices={indices}", f"a list of them, [{indices}]")
         if not len(indices):
             return []
         given = self.condition_tensor(condition, len(indices))
@@ -318,6 +321,8 @@ class Generator:
         Arguments and errors are those of ``range_images``.
         """
         refuse_worker(self.device)
+        if not 0 <= guidance <= 100:
+            raise ConfigError(f"guidance {guidance}", "0 to 100; 1 is no guidance")
         given = self.condition_tensor(condition, len(indices))
         codec = self.codec
         grid = self.header.grid(steps) if times is None else read_grid(times)
@@ -379,7 +384,13 @@ class Generator:
         ), encode(condition)
 
     def condition_tensor(self, given: Any, count: int) -> Tensor | None:
-        """The conditions (B, ...) as the network takes them, on its device."""
+        """The conditions (B, ...) as the network takes them, on its device; None for an
+        unconditional model.
+
+        Args:
+            given: as ``condition`` of ``range_images``, which names the errors too.
+            count: B.
+        """
         if given is None and self.condition is None:
             return None
         if self.condition is None:

@@ -9,6 +9,7 @@ order.
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
@@ -73,10 +74,10 @@ def uniform_grid(steps: int, start: float = 1.0, end: float = 0.0) -> tuple[floa
     """``steps`` + 1 evenly spaced times from ``start`` down to ``end``.
 
     Raises:
-        ConfigError: on fewer than one step.
+        ConfigError: on fewer than one step, or a part of one.
     """
-    if steps < 1:
-        raise ConfigError(f"{steps} steps", "at least 1")
+    if not isinstance(steps, Integral) or steps < 1:
+        raise ConfigError(f"{steps} steps", "a whole number, at least 1")
     return tuple((start * (steps - i) + end * i) / steps for i in range(steps + 1))
 
 
