@@ -194,7 +194,7 @@ def _edit(context: Context, change: Callable[["Scan"], Any]) -> Any:
             f"--box {given['box'][0]} of {len(scans)} scans",
             "--scan, the number of the scan that has these boxes",
         )
-    paths = {
+    paths: dict[str, Any] = {
         key: settle_path(given[key]) for key in ("source", "objects") if key in given
     }
     call = {"edit": context.info_name, **given, **paths, "out": None}

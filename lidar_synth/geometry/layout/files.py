@@ -104,7 +104,7 @@ def load_layout(path: str | Path) -> Layout:
         place = first["loc"]
         where = ".".join(map(str, place)) or "its top level"
         fault = first["msg"].partition(" or instance of")[0]
-        entry = place[0] if len(place) > 1 else ""
+        entry = str(place[0]) if len(place) > 1 else ""
         raise ConfigError(f"{path}: {where}: {fault}", _KEYS[entry]) from error
     rows = [_box(one, given.ground, path) for one in given.objects]
     boxes = Boxes(
