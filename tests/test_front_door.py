@@ -253,23 +253,33 @@ def test_a_trainers_files_name_what_exists(trainer: str, task: str) -> None:
     assert any("/data/HERE_TOO/mix.yaml" in text for text in files.values())
 
 
-@pytest.mark.parametrize(
-    ("trainer", "task"), [p for p in PAIRS if "train.sh" in TRAINERS[p[0]][p[1]]]
-)
-def test_scripts_are_of_any_folder(trainer: str, task: str, tmp_path: Path) -> None:
-    here = tmp_path / "my start"
-    here.mkdir()
-    files = configure(trainer, task, DEFAULTS[task], "/data/my scans", str(here))
-    show = """{ printf '%s\\n' "$LIDAR_SYNTH_MIX" "$@"; }"""
-    stubs = "".join(f"{name}() {show}\n" for name in ("python", "sed", "ln"))
-    script = stubs + files["train.sh"]
-    said = subprocess.run(
-        ["bash", "-ec", script], stdout=subprocess.PIPE, text=True, check=True
-    ).stdout
-    words = [said, *(path.read_text() for path in here.glob("*.yaml"))]
-    lines = "\n".join(words).splitlines()
-    assert f"{here}/mix.yaml" in lines
-    assert any("/data/my scans" in line for line in lines)
+ODD = 'Bob\'s "R&D" a|b\\new'
+
+
+@pytest.mark.parametrize(("trainer", "task"), PAIRS)
+def test_configurations_are_of_any_folder(
+    trainer: str, task: str, tmp_path: Path
+) -> None:
+    here = tmp_path / ODD
+    (here / "config").mkdir(parents=True)
+    (here / "config" / "semantickitti.yaml").write_text("data_path: there")
+    files = configure(trainer, task, DEFAULTS[task], f"/data/{ODD}", str(here))
+    words = set()
+    for name, text in files.items():
+        if name.endswith(".py"):
+            nodes = ast.walk(ast.parse(text))
+            words |= {node.value for node in nodes if isinstance(node, ast.Constant)}
+    if "train.sh" in files:
+        show = """{ printf '%s\\n' "$LIDAR_SYNTH_MIX" "$@"; }"""
+        script = f"python() {show}\nln() {show}\n{files['train.sh']}"
+        said = subprocess.run(["bash", "-c", script], cwd=here, capture_output=True)
+        words |= set(said.stdout.decode().splitlines())
+        assert f"{here}/mix.yaml" in words
+    for path in here.glob("cylinder3d.yaml"):
+        words.add(yaml.safe_load(path.read_text())["data_path"])
+    # Pointcept's is in a comment.
+    roots = {f"/data/{ODD}", f"/data/{ODD}/sequences/", f"{here}/kitti"}
+    assert roots & words
 
 
 def test_the_lists_of_mmdetection3d_are_written(tmp_path: Path) -> None:

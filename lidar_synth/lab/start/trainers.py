@@ -2,11 +2,12 @@
 
 ``ROOT`` stands for the folder of the real scans, of SemanticKITTI's the one that holds
 ``sequences``; ``REAL`` for the Python that opens them, ``MIX`` for the settings of the mixture, and
-``HERE`` for the folder of these files. Paths after no quotation mark are for a shell. To add a
-trainer, enter its files in ``TRAINERS``; every one begins with a comment that says where it belongs
-and what to type.
+``HERE`` for the folder of these files. Paths after no quotation mark are for a shell; ``'SED'`` is
+the root within a replacement of sed, in a string of YAML. To add a trainer, enter its files in
+``TRAINERS``; every one begins with a comment that says where it belongs and what to type.
 """
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -129,7 +130,7 @@ python -m lidar_synth.integrations.rangenet train.py -d ROOT -ac HERE/arch.yaml 
 
 _CYLINDER3D = """# in Cylinder3D: bash HERE/train.sh
 export LIDAR_SYNTH_MIX=MIX
-sed 's/SemKITTI_sk/SemKITTI_mixed/; s|data_path: .*|data_path: "ROOT/sequences/"|' \\
+sed 's/SemKITTI_sk/SemKITTI_mixed/; s|data_path: .*|data_path: "'SED'/sequences/"|' \\
     config/semantickitti.yaml > HERE/cylinder3d.yaml
 python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py \\
     --config_path HERE/cylinder3d.yaml
@@ -196,7 +197,7 @@ TRAINERS: dict[str, dict[str, dict[str, str]]] = {
 """{trainer: {task: {name of a file: its text}}}."""
 
 MIX = "mix.yaml"
-_WORDS = re.compile(r'"?\b(?:ROOT|REAL|MIX|HERE)\b')
+_WORDS = re.compile(r'"?\b(?:ROOT|REAL|MIX|HERE|SED)\b')
 
 DEFAULTS: dict[str, dict[str, Any]] = {
     "segmentation": {"epochs": 40},
@@ -254,13 +255,19 @@ def configure(
         )
     if Path(root, "dataset/sequences").is_dir():
         root += "/dataset"
-    words = {"REAL": real or _training_scans(root)}
+    in_sed = re.sub(r"[\\&|]", r"\\\g<0>", _escape(root))
+    words = {"REAL": real or _training_scans(root), "SED": shlex.quote(in_sed)}
     for word, path in {"ROOT": root, "MIX": f"{here}/{MIX}", "HERE": here}.items():
-        words |= {word: shlex.quote(path), f'"{word}': f'"{path}'}
+        words |= {word: shlex.quote(path), f'"{word}': f'"{_escape(path)}'}
     files = {MIX: write_mixture(settings)}
     for name, text in TRAINERS[trainer][task].items():
         files[name] = _WORDS.sub(lambda found: words[found[0]], text)
     return files
+
+
+def _escape(path: str) -> str:
+    """A path within a string of Python or YAML, in double quotation marks."""
+    return json.dumps(path, ensure_ascii=False)[1:-1]
 
 
 def _training_scans(root: str) -> str:
