@@ -3,6 +3,7 @@
 import ast
 import importlib
 import json
+import os
 import pickle
 import re
 import runpy
@@ -26,6 +27,7 @@ from lidar_synth.bank import Bank
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.recipes import folder, published, read_recipe
+from lidar_synth.lab.proof.page import write_body
 from lidar_synth.lab.start.look import look
 from lidar_synth.lab.start.trainers import DEFAULTS, TRAINERS, configure, write_files
 from lidar_synth.lab.town import export_town
@@ -280,6 +282,15 @@ def test_configurations_are_of_any_folder(
     # Pointcept's is in a comment.
     roots = {f"/data/{ODD}", f"/data/{ODD}/sequences/", f"{here}/kitti"}
     assert roots & words
+
+
+def test_names_of_folders_may_be_no_text(tmp_path: Path) -> None:
+    """Linux permits any bytes."""
+    name = os.fsdecode(b"a\xff")
+    write_files({"train.sh": f"cd {name}"}, tmp_path)
+    assert (tmp_path / "train.sh").read_bytes() == b"cd a\xff"
+    write_body(tmp_path / "index.html", name)
+    assert "a?" in (tmp_path / "index.html").read_text()
 
 
 def test_the_lists_of_mmdetection3d_are_written(tmp_path: Path) -> None:

@@ -25,7 +25,8 @@ def write_body(path: Path, content: str) -> None:
     template = (
         files("lidar_synth.lab.proof").joinpath("page.html").read_text(encoding="utf-8")
     )
-    write_file(path, template.replace("@body@", content).encode())
+    page = template.replace("@body@", content)
+    write_file(path, page.encode(errors="replace"))
 
 
 def body(values: Values) -> str:

@@ -282,4 +282,4 @@ def _training_scans(root: str) -> str:
 def write_files(files: dict[str, str], folder: Path) -> None:
     """Write configurations into a folder."""
     for name, text in files.items():
-        write_file(folder / name, text.encode())
+        write_file(folder / name, text.encode(errors="surrogateescape"))
