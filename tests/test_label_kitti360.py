@@ -164,6 +164,16 @@ def test_labels_of_a_dataset_that_has_moved_say_so(tmp_path: Path) -> None:
         open_scans(tmp_path)
 
 
+def test_labels_that_were_compared_are_kept_without(
+    root: Path, labelled: tuple[Path, LabelReport], tmp_path: Path
+) -> None:
+    out, first = labelled
+    shutil.copytree(out, tmp_path / "labels")
+    assert label_scans(root, tmp_path / "labels", progress=False).kept == 2
+    again = label_scans(root, tmp_path / "labels", against=root, progress=False)
+    assert again.kept == 2 and again.to_dict() == first.to_dict()
+
+
 @pytest.mark.slow
 def test_a_rerun_repeats_only_what_is_missing_or_changed(
     copy: Path, tmp_path: Path

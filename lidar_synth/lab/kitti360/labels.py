@@ -242,7 +242,10 @@ def _label_window(
     made_of = _inputs(root, against, job)
     record = _read_record(path)
     names = [f"{int(frame):010d}" for frame in record.get("fitting", ())]
-    if record.get("inputs") == made_of and all(
+    before = record.get("inputs", {})
+    # labels that were compared are the same without
+    given = {} if against else {"against": before.get("against")}
+    if before == made_of | given and all(
         (folder / f"{name}.label").is_file()
         and confidence_path(out, job.drive, name).is_file()
         for name in names
@@ -335,7 +338,10 @@ def _read_record(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     record = parse_json(read_text(path), str(path), "the record of a window")
-    if isinstance(record, dict) and isinstance(record.get("fitting"), list):
+    kinds = {"inputs": dict, "fitting": list}
+    if isinstance(record, dict) and all(
+        isinstance(record.get(name), kind) for name, kind in kinds.items()
+    ):
         return record
     return {}
 

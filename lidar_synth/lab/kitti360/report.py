@@ -75,23 +75,12 @@ class LabelCounts:
         """Add the comparison of a scan with its known train ids (N,); ``moving`` marks what
         moves."""
         known = truth != IGNORE
-        covered = (truth != IGNORE) & (train != IGNORE)
-        right = truth == train
-        cars = moving & (truth == TRAIN_ID["car"])
-        for name, mask in (
-            ("known", known),
-            ("covered", covered),
-            ("right", covered & right),
-        ):
+        covered = known & (train != IGNORE)
+        masks = [known, covered, covered & (truth == train)]
+        for name, mask in zip(CLASS_COUNTS[2:], masks, strict=True):
             self.classes[name] += _by_class(truth[mask])
-        masks = (
-            known,
-            covered,
-            covered & right,
-            cars,
-            cars & covered,
-            cars & covered & right,
-        )
+        cars = moving & (truth == TRAIN_ID["car"])
+        masks += [cars & mask for mask in masks]
         self.compared[frame] = [int(mask.sum()) for mask in masks]
 
     def __iadd__(self, other: "LabelCounts") -> "LabelCounts":
@@ -185,15 +174,13 @@ class LabelReport:
     def totals(self) -> dict[str, float]:
         """Shares of all points, and, if known labels were compared, of the points that have one."""
         counts = self.counts
-        shares = {
-            name: getattr(counts, name) / max(counts.points, 1)
-            for name in ("far", "disputed", "void", "moving")
-        }
-        labelled = float(counts.classes["points"].sum()) / max(counts.points, 1)
+        points = max(counts.points, 1)
         shares = {
             "on_clouds": counts.fit / max(counts.scans, 1),
-            "labelled": labelled,
-        } | shares
+            "labelled": float(counts.classes["points"].sum()) / points,
+        }
+        for name in ("far", "disputed", "void", "moving"):
+            shares[name] = getattr(counts, name) / points
         if self.compared:
             known, covered, right, *cars = np.sum(
                 list(self.compared.values()), axis=0
@@ -201,8 +188,6 @@ class LabelReport:
             shares |= {
                 "covered": covered / max(known, 1),
                 "right": right / max(covered, 1),
-            }
-            shares |= {
                 "cars_covered": cars[1] / max(cars[0], 1),
                 "cars_right": cars[2] / max(cars[1], 1),
             }
