@@ -335,6 +335,23 @@ def test_the_command_prints_json_and_takes_a_reference(
     assert not np.allclose(scores.values["range"], before)
 
 
+def test_a_reference_is_read_with_the_options_that_it_needs(
+    bank: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "real").mkdir()
+    scans = [unproject(images_with("range")[number]) for number in (12, 13)]
+    for number, scan in enumerate(scans):
+        bright = np.column_stack([scan.points, np.full(len(scan), 255.0)])
+        bright.astype(np.float32).tofile(tmp_path / "real" / f"{number}.bin")
+    (tmp_path / "real" / "0.bin").write_bytes(b"damaged")
+    reading = ["--reflectance-max", "255", "--on-bad", "skip"]
+    call("curate", bank, "--reference", tmp_path / "real", *reading, "--json")
+    skipped = read_scores(bank / FILE).values["range"]
+    (tmp_path / "real" / "0.bin").unlink()
+    call("curate", bank, "--reference", tmp_path / "real", *reading, "--json")
+    assert np.array_equal(read_scores(bank / FILE).values["range"], skipped)
+
+
 def test_scores_of_a_reference_with_other_scans_of_the_same_names_are_not_reused(
     bank: Path, tmp_path: Path
 ) -> None:
@@ -375,18 +392,25 @@ def test_scores_of_a_read_only_bank_are_saved_here(
         (["--out", "x"], "--out x without a rule; expected --drop as well"),
         (["--plot", "x.jpg"], "--plot x.jpg; expected a file that ends in .png"),
         (
-            ["--split", "train"],
-            "--split train without a reference; expected --reference as well",
+            ["--split", "train", "--fields", "5"],
+            "--split, --fields without a reference; expected --reference as well",
         ),
         (["--sort", "beauty"], "score 'beauty'; expected one of 'range', 'labels'"),
         (["--drop", "beauty > 1", "--out", "x"], "score 'beauty' in rule"),
+        (["--drop", "empty >= 0", "--out", "bank/good"], "inside of .*bank"),
         (["--drop", "empty >= 0", "--out", "x"], "all 20 scans of .* left out"),
     ],
 )
 def test_wrong_calls_write_nothing(
-    bank: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], message: str
+    bank: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: list[str],
+    message: str,
 ) -> None:
-    monkeypatch.chdir(bank)
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=message):
         call("curate", bank, *options)
-    assert not (bank / "x").exists()
+    assert not Path("x").exists()
+    # All but the last are refused before a scan is scored.
+    assert (bank / FILE).exists() == message.startswith("all")

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Option, echo
 
 from lidar_synth.cli.bank import BankFolder
-from lidar_synth.cli.options import Json, local_path
+from lidar_synth.cli.options import (
+    Json,
+    Reading,
+    drop_missing,
+    local_path,
+    options_from,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,6 +24,7 @@ if TYPE_CHECKING:
     from lidar_synth.lab.curate import Scores
 
 
+@options_from(Reading, after="reference")
 def curate(
     bank: BankFolder,
     drop: Annotated[
@@ -33,11 +40,10 @@ def curate(
     ] = None,
     reference: Annotated[
         str | None,
-        Option(help="scans whose mean histograms to compare with [the bank's own]"),
-    ] = None,
-    split: Annotated[
-        str | None,
-        Option(help="split of the reference, for instance r2flow/test"),
+        Option(
+            help="scans whose mean histograms to compare with [the bank's own]; the next options "
+            "are of these"
+        ),
     ] = None,
     sort: Annotated[
         str,
@@ -53,6 +59,7 @@ def curate(
     ] = None,
     as_json: Json = False,
     jobs: Annotated[int, Option(min=1, help="number of worker processes")] = 1,
+    **reading: Any,
 ) -> None:
     """Scores every scan of a bank, lists the most unusual ones, and writes a bank without those
     that match a rule.
@@ -90,8 +97,9 @@ def curate(
 
     opened = Bank(bank)
     rules = drop or []
-    _check(plot, out, rules)
-    scores = _scores(opened, bank, reference, split, jobs, progress=not as_json)
+    _check(plot, out, rules, bank, sort)
+    given = drop_missing(reading)
+    scores = _scores(opened, bank, reference, given, jobs, progress=not as_json)
     dropped = np.zeros(len(opened), bool)
     for rule in rules:
         dropped |= matching(rule, scores.values)
@@ -125,20 +133,32 @@ def curate(
         echo(f"{out}: {index.scans} scans in {len(index.shards)} shards; {why}")
 
 
-def _check(plot: Path | None, out: Path | None, rules: list[str]) -> None:
-    from lidar_synth.errors import ConfigError
+def _check(
+    plot: Path | None, out: Path | None, rules: list[str], bank: str, sort: str
+) -> None:
+    """Refuse options that do not fit, before any scan is scored."""
+    import numpy as np
 
+    from lidar_synth.errors import ConfigError, choose
+    from lidar_synth.files.claims import require_outside
+    from lidar_synth.lab.curate import MEANINGS, matching
+
+    choose("score", sort.removeprefix("-"), MEANINGS)
+    for rule in rules:
+        matching(rule, dict.fromkeys(MEANINGS, np.zeros(1)))
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot {plot}", "a file that ends in .png")
     if out is not None and not rules:
         raise ConfigError(f"--out {out} without a rule", "--drop as well")
+    if out is not None:
+        require_outside(out, Path(bank))
 
 
 def _scores(
     opened: "Bank",
     bank: str,
     reference: str | None,
-    split: str | None,
+    given: dict[str, Any],
     jobs: int,
     progress: bool,
 ) -> "Scores":
@@ -158,15 +178,18 @@ def _scores(
         write_scores,
     )
 
-    if split is not None and reference is None:
-        raise ConfigError(f"--split {split} without a reference", "--reference as well")
-    source = None if reference is None else open_scans(reference, split=split)
+    if given and reference is None:
+        raise ConfigError(
+            f"--{', --'.join(given)} without a reference", "--reference as well"
+        )
+    source = None if reference is None else open_scans(reference, **given)
     name = ""
     if source is not None:
         which = hash_of_names(
             [*source.ids, *(scan_hash(source[i]) for i in (0, len(source) // 2, -1))]
         )
-        name = f"{len(source)} scans of {' '.join(filter(None, (reference, split)))} ({which[:8]})"
+        words = filter(None, (reference, given.get("split")))
+        name = f"{len(source)} scans of {' '.join(words)} ({which[:8]})"
     elsewhere = is_url(bank) or not os.access(bank, os.W_OK)
     places = (Path(bank) / FILE, Path(f"scores-{opened.identity[:12]}.npz"))
     for saved in (read_scores(place) for place in places if place.is_file()):

@@ -57,7 +57,8 @@ def evaluate(
     sensor: Annotated[
         str | None,
         Option(
-            help="sensor of both sets: a preset or a YAML file; the next options are of REAL"
+            help="sensor of both sets: a preset or a YAML file; the next options are of REAL, "
+            "and of FAKE where it needs them"
         ),
     ] = None,
     segmenter: Annotated[
@@ -125,7 +126,7 @@ def evaluate(
       lidar-synth evaluate SemanticKITTI town --objects
       lidar-synth evaluate KITTI town --detector pointpillar_7728.pth
     """
-    from lidar_synth.errors import DataError, choose
+    from lidar_synth.errors import choose
     from lidar_synth.formats import open_scans
     from lidar_synth.lab.evaluate import PROTOCOLS
     from lidar_synth.lab.evaluate import evaluate as compare
@@ -164,20 +165,8 @@ def evaluate(
                 raise BadParameter(f"goes with {needed}", param_hint=option)
     if protocol is not None:
         rules = choose("--protocol", protocol, PROTOCOLS)
-    given_for_real = drop_missing(reading)
-    sources = (
-        open_scans(real, sensor=sensor, **given_for_real),
-        open_scans(fake, sensor=sensor),
-    )
-    if given_for_real:
-        try:
-            sources[1].load(0)
-        except DataError as error:
-            raise DataError(
-                f"FAKE ({error})",
-                "scans that need no options of reading, as those given are of REAL",
-                f"Convert them first: lidar-synth convert {fake} OUT --to npz.",
-            ) from error
+    given = drop_missing({"sensor": sensor, **reading})
+    sources = (open_scans(real, **given), _open_fake(fake, given))
     if not training_data and (note := refuse_training_data(*sources, reading["split"])):
         echo(note, err=True)
     if judge is not None:
@@ -210,6 +199,19 @@ def evaluate(
         echo(note, err=True)
     if beside:
         echo(f"\n{published(scores)}")
+
+
+def _open_fake(path: Path, given: dict[str, Any]) -> "Source":
+    """FAKE, with the options of REAL but its layout and split, where it is not read without."""
+    from lidar_synth.errors import DataError
+    from lidar_synth.formats import open_scans
+
+    try:
+        source = open_scans(path, sensor=given.get("sensor"))
+        source.load(0)
+    except DataError:
+        return open_scans(path, **given | {"layout": None, "split": None})
+    return source
 
 
 def _print(figures: object, text: str, as_json: bool) -> None:

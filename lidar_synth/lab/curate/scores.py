@@ -200,7 +200,11 @@ def _means_of(source: Source, sensor: Sensor, jobs: int, progress: bool) -> Hist
 
 
 def _of_source(source: Source, sensor: Sensor, number: int) -> Histograms:
-    found = features(project(source[number], sensor))
+    # not the next one instead of a scan that is skipped
+    load = getattr(source, "load_or_skip", source.__getitem__)
+    if (scan := load(number)) is None:
+        return np.zeros(1), np.zeros(1)
+    found = features(project(scan, sensor))
     return found.ranges, found.classes
 
 
