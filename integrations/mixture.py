@@ -58,7 +58,7 @@ def take_classes(settings: dict[str, Any]) -> Taxonomy:
     """
     given = settings.pop("classes", "semantic_kitti")
     if not isinstance(given, Mapping):
-        if given not in FILE_CLASSES:
+        if not isinstance(given, str) or given not in FILE_CLASSES:
             raise ConfigError(
                 f"classes: {given}",
                 f"one of {', '.join(FILE_CLASSES)}, or {{class name: id}}",

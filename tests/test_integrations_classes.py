@@ -12,6 +12,7 @@ from lidar_synth.datasets.classes import (
     NAMES,
     SEMANTIC_KITTI,
     TRAIN_ID,
+    Taxonomy,
 )
 from lidar_synth.errors import ConfigError
 
@@ -88,6 +89,7 @@ def test_classes_of_ones_own() -> None:
 def test_classes_that_do_not_fit_are_refused() -> None:
     for wrong, said in (
         ("poss", "one of semantic_kitti"),
+        (["car", "road"], "one of semantic_kitti"),
         ({"bus": 3}, "some of car, bicycle"),
         ({"car": 0}, "1 to 65"),
     ):
@@ -101,3 +103,28 @@ def test_classes_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ConfigError, match="a map of classes with 10: 6"):
         trainer_ids(POSS, take_classes({}), table)
     assert take_classes({}) is SEMANTIC_KITTI
+
+
+WRONG: dict[str, tuple[Any, ...]] = {
+    "a train id beyond the classes": ({1: 19},),
+    "one that would wrap": ({1: 300},),
+    "one that is negative": ({1: -1},),
+    "a share": ({1: 1.7},),
+    "a name": ({1: "car"},),
+    "an id beyond 16 bits": ({70_000: 3},),
+    "an id that would be another": ({-1: 3},),
+    "a name as id": ({"a": 3},),
+    "a truth as id": ({True: 3},),
+    "too few ids to write": ({1: 0}, (1, 2)),
+    "a negative id to write": ({1: 0}, (-1,) * len(NAMES)),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_table_of_classes_is_checked_when_it_is_made(case: str) -> None:
+    with pytest.raises(ConfigError, match="expected ids 0 to 65535, train ids 0 to 18"):
+        Taxonomy("mine", *WRONG[case])
+    assert (
+        Taxonomy("mine", {np.int64(3): np.uint8(IGNORE)}).decode(np.array([3]))
+        == IGNORE
+    )

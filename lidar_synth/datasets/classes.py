@@ -8,15 +8,16 @@ https://www.nuscenes.org/nuscenes#lidarseg, PandaSet's ``classes.json``, Waymo's
 ``segmentation.proto`` and http://www.poss.pku.edu.cn/semanticposs.html.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeGuard
+from numbers import Integral
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import ConfigError, DataError
 
 IGNORE = 255
 
@@ -105,6 +106,10 @@ class Taxonomy:
         from_train: the class id to write for each train id; ``None`` if the package does not write
             this dataset's format.
 
+    Raises:
+        ConfigError: on ids that are no whole numbers from 0 to 65535, other train ids, or not 19 of
+            ``from_train``.
+
     Example:
         >>> import numpy as np
         >>> from lidar_synth.datasets.classes import SEMANTIC_KITTI
@@ -118,6 +123,18 @@ class Taxonomy:
     name: str
     to_train: Mapping[int, int]
     from_train: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        written = self.from_train or (0,) * len(NAMES)
+        train = (*range(len(NAMES)), IGNORE)
+        wrong = _others((*self.to_train, *written), range(1 << 16))
+        wrong += _others(self.to_train.values(), train)
+        if wrong or len(written) != len(NAMES):
+            raise ConfigError(
+                f"classes {self.name!r} with {wrong[:8] or f'{len(written)} ids to write'}",
+                f"ids 0 to 65535, train ids 0 to {len(NAMES) - 1} or {IGNORE}, and none or "
+                f"{len(NAMES)} ids to write",
+            )
 
     @cached_property
     def _table(self) -> NDArray[np.int16]:
@@ -181,6 +198,17 @@ class Taxonomy:
                 "0..18, or 255 = ignore",
             )
         return table[train]
+
+
+def _others(values: Iterable[Any], allowed: Container[int]) -> list[Any]:
+    """The values that are none of some whole numbers."""
+    return [
+        value
+        for value in values
+        if isinstance(value, bool)
+        or not isinstance(value, Integral)
+        or int(value) not in allowed
+    ]
 
 
 def _by_name(
