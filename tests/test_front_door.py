@@ -89,6 +89,20 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+def test_a_scan_that_is_skipped_is_no_other_one(tmp_path: Path) -> None:
+    MAKERS["semantic_kitti"](tmp_path)
+    first, *others = sorted(tmp_path.rglob("*.bin"))
+    first.write_bytes(b"damaged")
+    skipped = pytest.warns(UserWarning, match="skipped scan")
+    with skipped:
+        found = look(tmp_path, None, tmp_path / "none.yaml", {"on_bad": "skip"})
+    assert found.looked == found.labelled == len(others)
+    for path in others:
+        path.write_bytes(b"damaged")
+    with skipped, pytest.raises(DataError, match="none of the 3 scans"):
+        look(tmp_path, None, tmp_path / "none.yaml", {"on_bad": "skip"})
+
+
 @pytest.mark.parametrize("vendor", LOGS)
 def test_the_sensor_of_a_vendors_logs_is_fitted(vendor: str, tmp_path: Path) -> None:
     sensor, columns = LOGS[vendor]

@@ -129,7 +129,7 @@ def look(
         options["sensor"] = str(sensor)
     given = fit.sensor if fit else sensor
     source = open_scans(root, sensor=given, **reading)
-    scans = [source[i] for i in spread(range(len(source)), LOOKED)]
+    scans = _some(source)
     if fit is not None:
         options["sensor"] = str(fitted)
     found = Findings(
@@ -154,11 +154,17 @@ def look(
     return found
 
 
+def _some(source: ScanFiles) -> list[Scan]:
+    """The readable ones of ``LOOKED`` scans, or else the first that is."""
+    chosen = spread(range(len(source)), LOOKED)
+    return source.load_readable(chosen) or [source[0]]
+
+
 def _fit(root: Path, reading: dict[str, Any]) -> SensorFit | None:
     """A sensor for scans that contradict their layout's own; None if they do not."""
     source = open_scans(root, **reading)
     source.skip_sensor_check()
-    scans = [source[i] for i in spread(range(len(source)), LOOKED)]
+    scans = _some(source)
     faults = [agreement(s.points, s.sensor).faults(s.sensor) for s in scans]
     if not all(faults):
         return None
