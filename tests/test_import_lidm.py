@@ -36,13 +36,22 @@ from lidar_synth.lab.importers.lidm import read_lidm
 from lidar_synth.lab.importers.lidm_names import FIRST_STAGE, UNET, UNET_EMA
 
 
-def run_import(path: Path, out: Path) -> str:
+def run_import(path: Path, out: Path, *options: str) -> str:
     from lidar_synth.cli import app
 
-    result = CliRunner().invoke(app, ["import", str(path), str(out), "--peer", "lidm"])
+    given = ["import", str(path), str(out), "--peer", "lidm", *options]
+    result = CliRunner().invoke(app, given)
     if result.exception is not None:
         raise result.exception
     return result.output
+
+
+def test_an_autoencoder_has_no_scans_to_look_at(tmp_path: Path) -> None:
+    first = MODELS["first stage"]
+    path = release(tmp_path, config_of(first), random_weights(first, tmp_path))
+    with pytest.raises(ConfigError, match="an autoencoder.*Leave out --check"):
+        run_import(path, tmp_path / "out.safetensors", "--check")
+    assert not (tmp_path / "out.safetensors").exists()
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -49,13 +49,21 @@ def import_(
 
       lidar-synth import diffusion_0000300000.pth r2dm.safetensors --peer r2dm
     """
-    from lidar_synth.generate.checkpoint import save_checkpoint
+    from lidar_synth.generate.checkpoint import VELOCITY, save_checkpoint
     from lidar_synth.lab.importers import IMPORTERS
     from lidar_synth.lab.importers.check import check_model
 
     if peer not in IMPORTERS:
         raise ConfigError(f"--peer {peer}", f"one of {', '.join(IMPORTERS)}")
+    if condition is not None and not check:
+        raise ConfigError(f"--condition {condition} without --check", "--check as well")
     header, networks = IMPORTERS[peer](file)
+    if check and VELOCITY not in networks:
+        raise ConfigError(
+            f"--check of {file}, an autoencoder",
+            "weights that generate scans",
+            "Leave out --check.",
+        )
     digest = save_checkpoint(out, header, networks)
     counts = [
         f"{n} {sum(p.numel() for p in net.parameters()) / 1e6:.1f} M parameters"

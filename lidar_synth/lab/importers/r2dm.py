@@ -17,13 +17,18 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
+from lidar_synth.files.torch_files import MISFITS, state_of
 from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.models import assemble
 from lidar_synth.generate.models.efficient_unet import LIMIT, PREDICTIONS
 from lidar_synth.generate.models.positions import BASES
 from lidar_synth.geometry.normalize import Normalisation
-from lidar_synth.lab.importers.r2flow import check_octaves, describe_source, sensor_of
+from lidar_synth.lab.importers.r2flow import (
+    check_octaves,
+    describe_source,
+    load_fields,
+    sensor_of,
+)
 
 STEPS = 256
 """Steps of the checkpoint's time grid."""
@@ -82,13 +87,7 @@ def read_r2dm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         DataError: on a file that is not such a checkpoint, is truncated or contains code, or whose
             keys do not fit.
     """
-    content = load_pickle(path, "R2DM")
-    if not isinstance(content, dict) or not {"cfg", "ema_weights"} <= set(content):
-        given = sorted(map(str, content))[:8] if isinstance(content, dict) else content
-        raise DataError(
-            f"{path} holds {str(given)[:200]}",
-            "R2DM's dictionary with cfg and ema_weights among its keys",
-        )
+    content = load_fields(path, "R2DM", "ema_weights")
     try:
         cfg = content["cfg"]
         for (group, key), values in SUPPORTED.items():

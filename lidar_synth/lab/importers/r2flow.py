@@ -57,6 +57,8 @@ BLOCK = {
     "feed_forward.layer.contract.weight": "residual_ffn.linear.weight",
 }
 """Names inside a block: ours to R2Flow's."""
+GROUPS = ("data", "flow", "training", "finetuning")
+"""Groups of the configuration that tell the recipe."""
 HARMONICS = ("residual_attn.rope.freqs_h", "residual_attn.rope.freqs_w")
 FOURIER = ("spatial_pe.0.embedding.freqs", "spatial_pe.0.embedding.phase")
 
@@ -72,11 +74,12 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         DataError: on a file that is not such a checkpoint, is truncated or contains code, or whose
             keys do not fit.
     """
-    content, weights = _load(path)
+    content = load_fields(path, "R2Flow", "weights")
+    weights = state_of(content, "weights", path)
     try:
-        data = content["cfg"]["data"]
-        model = content["cfg"]["model"]
-        part = _network(data, model, path)
+        cfg = content["cfg"]
+        data = cfg["data"]
+        part = _network(data, cfg["model"], path)
         normalisation = _normalisation(data, path)
         header = Header(
             networks={VELOCITY: part},
@@ -85,8 +88,14 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             channels=("range", "reflectance")
             if data["train_reflectance"]
             else ("range",),
-            time_grid=_time_grid(content["cfg"]),
-            provenance=_provenance(content, path),
+            time_grid=uniform_grid(
+                cfg["finetuning"]["k_distil"] or cfg["flow"]["num_sampling_steps"]
+            ),
+            provenance={
+                **describe_source(path, data["dataset"], "R2Flow"),
+                "images": content.get("num_images"),
+                "recipe": {group: cfg.get(group) for group in GROUPS},
+            },
         )
         return header, {VELOCITY: convert(weights, part, str(path))}
     except DataError:
@@ -98,10 +107,11 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         ) from error
 
 
-def _load(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The content of a file, and its weights."""
-    content = load_pickle(path, "R2Flow")
-    if not isinstance(content, dict) or not {"cfg", "weights"} <= set(content):
+def load_fields(path: Path, peer: str, weights: str) -> dict[str, Any]:
+    """The content of a file of R2Flow or R2DM, with the configuration and the weights of this name;
+    a DataError names the keys of another file."""
+    content = load_pickle(path, peer)
+    if not isinstance(content, dict) or not {"cfg", weights} <= set(content):
         given = (
             sorted(map(str, content))[:8]
             if isinstance(content, dict)
@@ -109,9 +119,9 @@ def _load(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         )
         raise DataError(
             f"{path} holds {given}",
-            "R2Flow's dictionary with cfg and weights among its keys",
+            f"{peer}'s dictionary with cfg and {weights} among its keys",
         )
-    return content, state_of(content, "weights", path)
+    return content
 
 
 def _network(
@@ -173,32 +183,15 @@ def sensor_of(data: Mapping[str, Any]) -> Sensor:
     return sensor
 
 
-def _time_grid(cfg: Mapping[str, Any]) -> tuple[float, ...]:
-    return uniform_grid(
-        cfg["finetuning"]["k_distil"] or cfg["flow"]["num_sampling_steps"]
-    )
-
-
-def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    cfg = content["cfg"]
-    groups = ("data", "flow", "training", "finetuning")
-    return {
-        **describe_source(path, cfg["data"]["dataset"], "R2Flow"),
-        "images": content.get("num_images"),
-        "recipe": {group: cfg.get(group) for group in groups},
-    }
-
-
 def describe_source(path: Path, dataset: str, peer: str) -> dict[str, Any]:
     """What a file of R2Flow or R2DM, which share their data and their author, learnt from."""
     # The split of KITTI raw is not published.
     known = all_frames(KITTI360, KITTI360_SPLITS["r2flow/train"] or ())
-    seen = {"seen": known.to_list()} if dataset == "kitti_360" else {}
+    seen = {"split": "r2flow/train", "seen": known.to_list()}
     return {
         "data": DATA[dataset][0],
         "data_licence": "CC BY-NC-SA 3.0",
-        "split": "r2flow/train",
-        **seen,
+        **(seen if dataset == "kitti_360" else {}),
         "licence": f"as {peer}'s repository: MIT",
         "source": f"https://github.com/kazuto1011/{peer.lower()}",
         "file": path.name,
