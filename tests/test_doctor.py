@@ -25,6 +25,7 @@ from lidar_synth.cli.diagnosis import (
     works,
 )
 from lidar_synth.cli.doctor import doctor as command
+from lidar_synth.lab.evaluate.extractors.specification import FOLDER_VARIABLE
 
 app = typer.Typer(add_completion=False)
 app.command()(command)
@@ -192,7 +193,7 @@ def test_why_there_is_no_card(
     assert found in finding.found
 
 
-@pytest.mark.parametrize("variable", sorted(DATA_ROOTS))
+@pytest.mark.parametrize("variable", sorted({*DATA_ROOTS, FOLDER_VARIABLE}))
 def test_data_roots_are_checked(
     variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

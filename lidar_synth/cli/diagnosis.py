@@ -81,6 +81,7 @@ DATA_ROOTS = {
     "PANDASET_ROOT": ("*/lidar/*.pkl.gz", ()),
     "LIDAR_SYNTH_REAL_SCANS": ("manifest.csv", ()),
     "LIDAR_SYNTH_GOLDEN": ("*.npz", ()),
+    "LIDAR_SYNTH_METRICS": ("*", ()),
 }
 """Environment variables that name data: a pattern of required files, and optional folders."""
 
