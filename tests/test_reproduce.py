@@ -208,10 +208,13 @@ def test_what_cannot_be_is_refused(
         f"pixel.techer={released}": "stage 'techer'.* Did you mean 'teacher'",
         f"pixel.codec={released}": "stage 'codec'; expected one of 'teacher'",
         f"pixel.teacher={released}s": "x.pths'; expected TASK.STAGE=FILE with a file",
+        f"pixel={released}": "expected TASK.STAGE=FILE with a task of pixel",
         "pixel.teacher": "expected TASK.STAGE=FILE with a file that exists",
     }.items():
         with pytest.raises(ConfigError, match=expected):
             call("reproduce", "table1", "--tiny", "--use", use, "--out", tmp_path)
+    with pytest.raises(ConfigError, match="--weights nowhere; expected a folder"):
+        call("reproduce", "table1", "--tiny", "--weights", "nowhere")
     monkeypatch.delenv("KITTI360_ROOT")
     with pytest.raises(
         ConfigError, match="no KITTI360_ROOT for latent; expected --data"

@@ -56,12 +56,15 @@ def reproduce(
       lidar-synth reproduce table1 --data DATASETS --weights metrics --device cuda
       lidar-synth reproduce table1 --data DATASETS --use pixel.teacher=r2flow-kitti360-1rf.pth
     """
+    from lidar_synth.errors import ConfigError
     from lidar_synth.lab.reproduce import report
     from lidar_synth.lab.reproduce.tables import find_table
     from lidar_synth.lab.reproduce.work import TaskRun, find_data, write_town
 
     if tenth and tiny:
         raise BadParameter("give one of the two", param_hint="--tenth, --tiny")
+    if weights is not None and not weights.is_dir():
+        raise ConfigError(f"--weights {weights}", "a folder that exists")
     spec = find_table(table)
     scale = "tiny" if tiny else "tenth" if tenth else "full"
     folder = out / scale / "estimate" if estimate else out / scale

@@ -116,7 +116,7 @@ def given_weights(
     for text in given:
         place, _, path = text.partition("=")
         task, _, stage = place.partition(".")
-        if task not in found:
+        if task not in found or not stage:
             raise ConfigError(
                 f"--use {text!r}", f"TASK.STAGE=FILE with a task of {', '.join(tasks)}"
             )

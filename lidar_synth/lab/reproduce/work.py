@@ -244,8 +244,8 @@ class TaskRun:
 
 
 def find_data(root: Path | None) -> None:
-    """Let recipes find the datasets in ``root``, or in folders of it; those that the environment
-    names already stay.
+    """Let recipes find the datasets in ``root``, or in folders of it; one that is not there stays
+    where the environment names it.
 
     Raises:
         ConfigError: where there is neither KITTI-360 nor SemanticKITTI.
