@@ -165,8 +165,8 @@ def evaluate(
                 raise BadParameter(f"goes with {needed}", param_hint=option)
     if protocol is not None:
         rules = choose("--protocol", protocol, PROTOCOLS)
-    given = drop_missing({"sensor": sensor, **reading})
-    sources = (open_scans(real, **given), _open_fake(fake, given))
+    of_real = drop_missing({"sensor": sensor, **reading})
+    sources = (open_scans(real, **of_real), _open_fake(fake, of_real))
     if not training_data and (note := refuse_training_data(*sources, reading["split"])):
         echo(note, err=True)
     if judge is not None:
