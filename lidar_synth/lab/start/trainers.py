@@ -2,8 +2,8 @@
 
 ``ROOT`` stands for the folder of the real scans, of SemanticKITTI's the one that holds
 ``sequences``; ``REAL`` for the Python that opens them, ``MIX`` for the settings of the mixture, and
-``HERE`` for the folder of these files. Paths after no quotation mark are for a shell; ``'SED'`` is
-the root within a replacement of sed, in a string of YAML. To add a trainer, enter its files in
+``HERE`` for the folder of these files. Paths after no quotation mark are for a shell; ``"SED``
+is the root within a replacement of sed, in a string of YAML. To add a trainer, enter its files in
 ``TRAINERS``; every one begins with a comment that says where it belongs and what to type.
 """
 
@@ -130,7 +130,7 @@ python -m lidar_synth.integrations.rangenet train.py -d ROOT -ac HERE/arch.yaml 
 
 _CYLINDER3D = """# in Cylinder3D: bash HERE/train.sh
 export LIDAR_SYNTH_MIX=MIX
-sed 's/SemKITTI_sk/SemKITTI_mixed/; s|data_path: .*|data_path: "'SED'/sequences/"|' \\
+sed 's/SemKITTI_sk/SemKITTI_mixed/; s|data_path: .*|data_path: "SED/sequences/"|' \\
     config/semantickitti.yaml > HERE/cylinder3d.yaml
 python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py \\
     --config_path HERE/cylinder3d.yaml
@@ -256,7 +256,8 @@ def configure(
     if Path(root, "dataset/sequences").is_dir():
         root += "/dataset"
     in_sed = re.sub(r"[\\&|]", r"\\\g<0>", _escape(root))
-    words = {"REAL": real or _training_scans(root), "SED": shlex.quote(in_sed)}
+    in_sed = in_sed.replace("'", r"'\''")
+    words = {"REAL": real or _training_scans(root), '"SED': f'"{in_sed}'}
     for word, path in {"ROOT": root, "MIX": f"{here}/{MIX}", "HERE": here}.items():
         words |= {word: shlex.quote(path), f'"{word}': f'"{_escape(path)}'}
     files = {MIX: write_mixture(settings)}
