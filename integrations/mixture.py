@@ -27,7 +27,7 @@ from lidar_synth.geometry import Scan
 from lidar_synth.labels.own import IgnoreLabels, RemoveLabels
 from lidar_synth.labels.policies import read_policy
 from lidar_synth.mixing import MixedScans, MixingPlan
-from lidar_synth.mixing.schedules import settled
+from lidar_synth.mixing.schedules import constant_from
 from lidar_synth.mixing.settings import (
     OPTIONS,
     VARIABLE,
@@ -86,7 +86,7 @@ def synthetic_epoch(mixed: MixedScans, epoch: int = 0) -> int | None:
 
     Of a schedule that never settles the first hundred epochs count.
     """
-    last = settled(mixed.mixture.ratio)
+    last = constant_from(mixed.mixture.ratio)
     later = range(epoch + 1, 1 + (100 if last is None else last))
     tried = chain(range(epoch, -1, -1), later)
     return next((e for e in tried if MixingPlan(mixed.mixture, e).synthetics), None)

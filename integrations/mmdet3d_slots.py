@@ -32,7 +32,7 @@ from lidar_synth.files.disk import read_text
 from lidar_synth.formats.calibration import Calibration, in_view
 from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry import Scan
-from lidar_synth.mixing.schedules import settled
+from lidar_synth.mixing.schedules import constant_from
 
 PREFIX = "lsynth://"
 MIXTURE = "mixture.json"
@@ -146,7 +146,7 @@ class SlotFolder:
         """Whether every epoch has each entry of the list once: one ratio, and all real scans."""
         return (
             self.mixed.mixture.epoch_size == "add"
-            and settled(self.mixed.mixture.ratio) == 0
+            and constant_from(self.mixed.mixture.ratio) == 0
         )
 
     def entries(self, epoch: int) -> NDArray[np.int64]:

@@ -114,7 +114,7 @@ def test_scans_are_made_in_the_order_of_their_use() -> None:
     ledger.give_back(ledger.lend(5))
     assert claimed(ledger) == [7]
     lent = [ledger.lend(1), ledger.lend(5)]
-    assert ledger._room(99) is None  # two are read, two are still to be used
+    assert ledger._to_overwrite(99) is None  # two are read, two are still to be used
     ledger.give_back(lent[1])
     assert claimed(ledger) == [8]
 
@@ -141,7 +141,7 @@ def test_a_scan_for_which_a_reader_waits_is_not_overwritten() -> None:
     ledger = Ledger(1, np.zeros(4, np.int64))
     ledger._awaited += [5, 6]  # as two readers leave it that have not woken up yet
     assert claimed(ledger) == [5]
-    assert ledger._room(-1) is None
+    assert ledger._to_overwrite(-1) is None
     ledger._awaited.remove(5)
     assert claimed(ledger) == [6]
 

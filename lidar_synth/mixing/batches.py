@@ -83,7 +83,7 @@ def cut_steps(
 
     Each step holds ``batch_size`` samples for each rank. The remainder becomes a smaller step, or
     is added to the last step if it has fewer samples than there are ranks. All ranks thus take the
-    same number of steps, and no rank waits for another for ever. ``drop_last`` drops the remainder;
+    same number of steps, and none waits forever for another. ``drop_last`` drops the remainder;
     ``join=False`` never adds it to the last step.
     """
     size = batch_size * world_size
@@ -105,12 +105,12 @@ def rank_share(step: range, rank: int, world_size: int) -> range:
     return range(start, start + size + (rank < larger))
 
 
-def go_to(dataset: Epochs, epoch: int, position: int) -> None:
+def resume_epoch(dataset: Epochs, epoch: int, position: int) -> None:
     """Set the dataset to the epoch of a loaded state.
 
-    A ``StatefulDataLoader`` loads its state when it begins to iterate, which is after
-    ``set_epoch``. If the state marks the end of an epoch and the trainer has set the next epoch
-    already, that epoch is kept.
+    If the state marks the end of an epoch and the trainer has already set the next one, that one
+    is kept: a ``StatefulDataLoader`` loads its state only when it begins to iterate, after
+    ``set_epoch``.
     """
     if not (dataset.epoch == epoch + 1 and position >= len(dataset)):
         dataset.set_epoch(epoch)
@@ -238,7 +238,7 @@ class MixedBatches(Divided, Sampler[list[int]]):
         self._start = check_state(state, self.dataset.mixture)
         self._taken = (0, 0)
         self.dataset.current.forget_pass()
-        go_to(self.dataset, *self._start)
+        resume_epoch(self.dataset, *self._start)
 
     def _batches(self, epoch: int, steps: CutSteps) -> Iterator[list[int]]:
         announced = 0

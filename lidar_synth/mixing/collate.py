@@ -22,7 +22,7 @@ Form = Literal["offsets", "padded", "range"]
 """The layout of a batch, see ``Collate``."""
 
 _KEYS = {"points", "label", "confidence", "boxes", "names", "domain", "id"}
-"""Of the items that a batch is made of."""
+"""The keys that every item of a batch must have."""
 
 Unlabelled = Literal["error", "allow"]
 """Whether a batch without any valid label raises an error or is returned."""
@@ -78,9 +78,9 @@ class Collate:
         """
         for item in items:
             if not isinstance(item, dict) or not item.keys() >= _KEYS:
-                given = sorted(item) if isinstance(item, dict) else type(item).__name__
+                form = sorted(item) if isinstance(item, dict) else type(item).__name__
                 raise ConfigError(
-                    f"a sample of the form {given}",
+                    f"a sample of the form {form}",
                     f"a dict with {', '.join(sorted(_KEYS))}, as to_item makes it",
                     "Give MixedScans(..., to_sample=..., collate=function), a function for "
                     "samples of your form.",
@@ -113,11 +113,10 @@ class Collate:
 
 
 def collate_by_default(items: Sequence[Item], **options: Any) -> Any:
-    """What ``DataLoader`` does to items without a ``collate_fn``, which fails for scans of
-    different sizes.
+    """torch's default collation, for a ``DataLoader`` without a ``collate_fn``.
 
     Raises:
-        ConfigError: on such scans.
+        ConfigError: on scans of different sizes, which it cannot stack.
     """
     try:
         return default_collate([dict(item) for item in items])
@@ -129,7 +128,7 @@ def collate_by_default(items: Sequence[Item], **options: Any) -> Any:
         ) from error
 
 
-# As torch's documentation of default_collate says.
+# torch's documented way to define the default collation of a type.
 default_collate_fn_map[Item] = collate_by_default
 
 

@@ -83,8 +83,8 @@ def check_alike(
         real: the trainer's datasets; the first sample of the first one is used.
         synthetic: the sources.
         finish: ``(source, scan, rng) -> sample``, what the mixture does to a scan of a source.
-        weighs: whether samples have weights in the loss, which only a dict with ``loss_weight``
-            gets.
+        weighs: whether the mixture has loss weights; samples must then be dicts with the key
+            ``loss_weight``.
 
     Raises:
         ConfigError: if keys, types, dtypes, ranks or the value for "ignore" differ, or units, axes,
@@ -99,7 +99,7 @@ def check_alike(
             make = partial(finish, number)
             sample = _try(
                 "synthetic",
-                lambda own, s: own(_scan_of(s), keyed_rng(0)),
+                lambda make, source: make(_scan_of(source), keyed_rng(0)),
                 make,
                 source,
             )
@@ -119,25 +119,25 @@ def check_alike(
             if weighs and not (isinstance(sample, dict) and "loss_weight" in sample):
                 raise weightless()
             if _tables(expected) and not _is_on_demand(source):
-                _compare_more(dataset, expected, source, make)
+                _compare_several(dataset, expected, source, make)
 
 
 def weightless() -> ConfigError:
-    """The error for samples that a weight has no place in."""
+    """The error for samples that have no key for their loss weight."""
     return ConfigError(
         "loss_weight for samples without the key loss_weight",
-        "dicts with it, in which the weight of the plan is written",
+        "dicts with that key, in which the mixture writes the weight",
         "If you multiply by train.loss_weight(i), pass compare=False.",
     )
 
 
-def _compare_more(
+def _compare_several(
     dataset: Any,
     first: Any,
     source: Synthetic,
     make: Callable[[Scan, np.random.Generator], Any],
 ) -> None:
-    """Compare what several samples of a dataset and of a source mean."""
+    """Compare the meaning of several samples of a dataset with that of several of a source."""
     real = [
         _try("real", dataset.__getitem__, i)
         for i in spread(range(len(dataset)), SEARCHED)[1:]
@@ -154,7 +154,7 @@ def _compare_more(
 
 
 def report(found: Sequence[Contradiction]) -> None:
-    """Refuse what is certainly wrong, and log the rest.
+    """Raise an error if any contradiction is certain; otherwise log all as warnings.
 
     Raises:
         ConfigError: if any contradiction is certain.
@@ -162,7 +162,7 @@ def report(found: Sequence[Contradiction]) -> None:
     if any(each.certain for each in found):
         texts = [each.text for each in sorted(found, key=lambda each: not each.certain)]
         raise ConfigError(
-            "synthetic samples that mean something else than the real ones: "
+            "synthetic samples whose values mean something else than those of real ones: "
             f"{'; '.join(texts[:4])}",
             "the same units, axes, origin, scales and classes",
             "Change to_sample (lidar-synth check-mix shows the scans themselves), or pass "
@@ -291,8 +291,8 @@ def _parts(value: Any) -> dict[str, Any]:
 
 
 def _unknown_values(dataset: Any, real: Any, synthetic: Any) -> Iterator[str]:
-    """Describe label values of a synthetic sample that are no class and occur in none of the
-    searched real samples."""
+    """Describe label values of a synthetic sample that cannot be classes and occur in none of the
+    first ``SEARCHED`` real samples."""
     real_labels = dict(_labels(real, np.inf))
     labels = dict(_labels(synthetic))
     for place in [p for p in labels if p in real_labels]:
@@ -340,29 +340,29 @@ def _tables(sample: Any) -> dict[str, Table]:
     """{place: points} of the arrays of real numbers that have many rows, with the labels that
     belong to them."""
     arrays = dict(_arrays(sample))
-    named = {
-        p: a for p, a in arrays.items() if a.dtype.kind in "iu" and _may_be_labels(p)
-    }
-    found = {}
+    labels = [
+        a for p, a in arrays.items() if a.dtype.kind in "iu" and _may_be_labels(p)
+    ]
+    tables = {}
     for place, array in arrays.items():
         rows = _rows(array) if array.dtype.kind == "f" else None
         if rows is not None:
-            fitting = (
+            of_rows = (
                 a.ravel()
-                for a in named.values()
+                for a in labels
                 if a.size == len(rows) and len(np.unique(a)) <= FEW
             )
-            label = next(fitting, None)
+            label = next(of_rows, None)
             reach = np.ptp(np.quantile(rows, (0.01, 0.99), axis=0), axis=0)
             spatial = (
                 array.ndim == 2
                 and len(reach) > 2
                 and bool((reach[:3] > (5, 5, 0.5)).all())
             )
-            found[place] = Table(
+            tables[place] = Table(
                 rows, None if label is None else label.astype(np.int64), spatial
             )
-    return found
+    return tables
 
 
 def _may_be_labels(place: str) -> bool:
@@ -405,8 +405,8 @@ def _arrays(
 
 
 def _try(kind: str, fetch: Callable[..., Any], *which: Any) -> Any:
-    """A sample, or None if it cannot be read: training will raise the same error, or the dataset
-    may skip it."""
+    """A sample, or None with a warning if it cannot be read: training will raise the same error,
+    unless the dataset skips such samples."""
     try:
         return fetch(*which)
     except Exception as error:  # a trainer's own code may raise anything
@@ -426,7 +426,8 @@ def _scan_of(source: Synthetic) -> Scan:
 
 
 def _is_on_demand(source: Synthetic) -> bool:
-    """Whether a source would have to start first: a generator or a rolling bank."""
+    """Whether a source makes scans on demand, and would have to start first: a generator or a
+    rolling bank."""
     return getattr(source, "on_demand", False) or hasattr(source, "expect")
 
 
@@ -469,7 +470,7 @@ def make_up_scan(sensor: Sensor, fields: frozenset[str]) -> Scan:
 @contextmanager
 def _preserved_generators() -> Iterator[None]:
     """Restore the global random generators of Python, numpy and torch afterwards."""
-    # numpy's is the generator that trainers use.
+    # numpy's legacy generator, because trainers use it.
     python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
     devices = (
         [torch.cuda.current_device()]

@@ -1,12 +1,13 @@
-"""What ``mix(epochs=...)`` does unless it is told otherwise: the recipe that gained most on real
-scans, by task.
+"""The default recipes of ``mix(epochs=...)``, by task: those that gained most on real scans.
 
-Segmentation: synthetic scans first, then half of each batch, real scans alone at the end, with
-persons and cycles of the town in the place of the synthetic scans' own, where labelled scans are
-few and of the synthetic scans' lasers; otherwise synthetic scans for a quarter of the epochs, then
-real scans alone, which gained less there but showed no loss on the street of the labels
-(docs/research/proof.md).
-Detection: the same schedule, with objects of the real scans pasted into all scans
+Segmentation with few labelled scans, whose sensor has the same lasers as the synthetic scans':
+synthetic scans alone first, then half of each batch, and real scans alone at the end. Persons and
+cycles of the town replace those of the synthetic scans.
+
+Segmentation otherwise: synthetic scans alone for a quarter of the epochs, then real scans alone.
+This gained less, but showed no loss on the street of the labels (docs/research/proof.md).
+
+Detection: the first schedule, with objects of the real scans pasted into all scans
 (docs/research/detectors.md).
 """
 
@@ -29,10 +30,10 @@ log = logging.getLogger(__name__)
 MEASURED = 24
 """Largest number of labelled scans with which a recipe for segmentation has been measured."""
 FEW = 40
-"""Labelled scans up to which synthetic scans first gain, if the gains of 7 mIoU with 4 scans and
-1.5 with 24 go on falling by the logarithm of their number."""
+"""Largest number of labelled scans with which training on synthetic scans first is expected to
+gain. Extrapolated: it gained 7 mIoU with 4 scans and 1.5 with 24, falling with the logarithm."""
 LEAST = 100
-"""Minimum number of samples of an epoch; as many as there are real scans, if these are more."""
+"""Minimum number of samples in an epoch; if there are more real scans, it is their number."""
 PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
 """Maximum number of objects of a bank that are pasted into a scan."""
 
@@ -52,8 +53,8 @@ TOWN_OBJECTS: Labels = {
         "clear": "same",
     }
 }
-"""Persons and cycles of the town in the place of a scan's own: from those that a model draws, a
-segmenter does not learn to find real ones."""
+"""Replaces the persons and cycles of a scan by those of the town, because a segmenter does not
+learn to find real ones from those that a model draws."""
 
 
 def augment_boxes(banks: Iterable[ObjectBank]) -> Compose:
@@ -61,14 +62,14 @@ def augment_boxes(banks: Iterable[ObjectBank]) -> Compose:
     and scale the scan."""
     steps: list[Any] = []
     for bank in banks:
-        there = set(bank.boxes.names)
-        count = {name: most for name, most in PASTED.items() if name in there}
+        names = set(bank.boxes.names)
+        count = {name: most for name, most in PASTED.items() if name in names}
         steps.append(PasteObjects(bank, count or 8, turn=180.0, clear=False))
     return Compose([*steps, {"yaw": {"limit": 45}}, "flip_x", "flip_y", "scale"])
 
 
 def quarter_of(epochs: int) -> dict[int, float]:
-    """The schedule of synthetic scans alone in a quarter of the epochs, then real scans alone.
+    """The schedule of synthetic scans alone for a quarter of the epochs, then real scans alone.
 
     Raises:
         ConfigError: on fewer than 4 epochs.
@@ -78,11 +79,11 @@ def quarter_of(epochs: int) -> dict[int, float]:
 
 
 def ends_on_real(real: int, same_sensor: bool) -> bool:
-    """Whether a segmenter's training ends on real scans alone.
+    """Whether a segmenter is trained by ``quarter_of``: most of the epochs on real scans alone.
 
     Args:
         real: number of real scans.
-        same_sensor: whether the synthetic scans are of a sensor with the real one's lasers.
+        same_sensor: whether the sensors of real and synthetic scans have the same lasers.
     """
     return real > FEW or not same_sensor
 
@@ -90,14 +91,16 @@ def ends_on_real(real: int, same_sensor: bool) -> bool:
 def segmentation_options(
     reals: Any, epochs: int, ratio: Any, same_sensor: bool
 ) -> dict[str, Any]:
-    """The arguments of ``MixedScans`` for a segmenter, none with a ratio; warns of that, and where
-    no gain has been measured.
+    """The arguments of ``MixedScans`` for training a segmenter; none if the user gives a ratio.
+
+    Logs a warning if a ratio is given, and if there are more real scans than a gain has been
+    measured with.
 
     Args:
         reals: the real samples, or ``Sources`` of several.
-        epochs: of the training.
-        ratio: in the place of the recipe's; None for none.
-        same_sensor: as ``ends_on_real``.
+        epochs: number of epochs of the training.
+        ratio: the user's ratio, which replaces the recipe, or None.
+        same_sensor: as for ``ends_on_real``.
 
     Raises:
         ConfigError: on fewer than 4 epochs.
@@ -127,11 +130,11 @@ def segmentation_options(
 
 
 def detection_options(real: Any, epochs: Any) -> dict[str, Any]:
-    """The arguments of ``MixedScans`` for a detector.
+    """The arguments of ``MixedScans`` for training a detector.
 
     Args:
         real: scans with boxes.
-        epochs: of the training.
+        epochs: number of epochs of the training.
 
     Raises:
         ConfigError: without real scans, or on fewer than 4 epochs.

@@ -16,22 +16,22 @@ from lidar_synth.mixing.schedules import Schedule, make_schedule, share_of
 Forward = Callable[[nn.Module, Any], Any]
 
 
-def make_weight(given: Any) -> Schedule:
+def make_weight(weight: Any) -> Schedule:
     """The weight of synthetic samples in the loss, by epoch.
 
     Args:
-        given: a number from 0 to 1, or one by epoch, as a ratio (``make_schedule``).
+        weight: a number from 0 to 1, or one by epoch in any form of ``make_schedule``.
 
     Raises:
         ConfigError: on anything else.
     """
     try:
-        schedule = make_schedule(given)
+        schedule = make_schedule(weight)
         share_of(schedule, 0)
         return schedule
     except ConfigError as error:
         raise ConfigError(
-            f"loss_weight={given!r}",
+            f"loss_weight={weight!r}",
             "the weight of synthetic samples in the loss, from 0 to 1, or one by epoch, such as "
             "{0: 1.0, 10: 0.1}",
         ) from error
@@ -43,10 +43,10 @@ def settle(
     """A copy of a network whose batch normalisation has the statistics of some batches, in
     evaluation mode.
 
-    Those of a training on a mixture are of real and synthetic scans together; a network that is
-    used on real scans wants those of real scans, which need no labels. A training that ends on
-    real scans, as by ``mix(epochs=40)``, leaves them already. A layer that sees no batch, as
-    the synthetic one of a ``ByDomain``, keeps its own.
+    After training on a mixture, the statistics are those of real and synthetic scans together. A
+    network that is used on real scans needs those of real scans; they need no labels. A training
+    that ends on real scans, such as with ``mix(epochs=40)``, needs no ``settle``. A layer that
+    sees no batch, such as the synthetic one of a ``ByDomain``, keeps its statistics.
 
     Args:
         model: the trained network; it stays as it is.
@@ -65,8 +65,8 @@ def settle(
         >>> settled.running_mean, network.running_mean
         (tensor([3.]), tensor([0.]))
     """
-    settled = deepcopy(model).eval().train()  # eval: ByDomain's real layer
-    norms, given = (
+    settled = deepcopy(model).eval().train()  # eval() sets ByDomain to its real layer
+    norms, originals = (
         [module for module in network.modules() if isinstance(module, _BatchNorm)]
         for network in (settled, model)
     )
@@ -81,10 +81,10 @@ def settle(
             count += 1
     if not count:
         raise ConfigError("no batch to settle on", "batches of real scans")
-    for norm, old in zip(norms, given, strict=True):
-        norm.momentum = old.momentum
+    for norm, original in zip(norms, originals, strict=True):
+        norm.momentum = original.momentum
         if norm.num_batches_tracked == 0:
-            norm.load_state_dict(old.state_dict())
+            norm.load_state_dict(original.state_dict())
     return settled.eval()
 
 
@@ -113,7 +113,7 @@ class ByDomain(nn.Module):
         self.domain: Tensor | None = None
 
     def train(self, mode: bool = True) -> Any:
-        """Set the mode; that of evaluation forgets the domains of the last training batch."""
+        """Set the mode; evaluation mode forgets the domains of the last training batch."""
         if not mode:
             self.domain = None
         return super().train(mode)
@@ -133,10 +133,10 @@ class ByDomain(nn.Module):
                 "For concatenated points: "
                 'batch["domain"].repeat_interleave(batch["offsets"].diff()).',
             )
-        of = [torch.nonzero(self.domain == number)[:, 0] for number in (0, 1)]
+        by_domain = [torch.nonzero(self.domain == number)[:, 0] for number in (0, 1)]
         parts = [
             layer(x[indices])
-            for layer, indices in zip(self.layers, of, strict=True)
+            for layer, indices in zip(self.layers, by_domain, strict=True)
             if len(indices)
         ]
-        return torch.cat(parts)[torch.argsort(torch.cat(of))]
+        return torch.cat(parts)[torch.argsort(torch.cat(by_domain))]

@@ -2,8 +2,8 @@
 
 ``MixedBatches`` yields positions that carry their epoch. Other samplers yield plain integers, which
 refer to the dataset's current epoch. DataLoader workers fetch ahead, so that ``set_epoch`` after
-``iter(loader)`` would mix two
-epochs: some scans would come twice and others never. Such a call therefore raises an error.
+``iter(loader)`` would mix two epochs: some scans would come twice and others never. Such a call
+therefore raises an error.
 """
 
 import os
@@ -33,6 +33,10 @@ SHARED_TWICE = (
 )
 
 _COUNTERS = 256  # one counter for each worker, so that none has to wait for another
+
+_EPOCH, _PASS, _WARNED, _USED = range(4)
+"""What the shared integers hold: the current epoch, the epoch of the latest pass, 1 once a repeated
+pass has been warned of, and 1 once the current epoch is used."""
 
 
 class Position(int):
@@ -68,8 +72,8 @@ def shared_integers(*values: int) -> Tensor:
 
 
 def share(tensor: Tensor) -> None:
-    """Move a tensor to shared memory, where that of a deep copy or of a pickle is not; one that was
-    sent to a spawned worker stays the main process's."""
+    """Move a tensor to shared memory unless it is there. A deep copy is not; a tensor that was sent
+    to a spawned worker is, and shares its values with the main process."""
     if not tensor.is_shared():  # type: ignore[no-untyped-call]
         tensor.share_memory_()  # type: ignore[no-untyped-call]
 
@@ -79,8 +83,6 @@ class CurrentEpoch:
     began."""
 
     def __init__(self) -> None:
-        # current epoch; epoch of the latest pass; 1 once it has warned; 1 once the current epoch is
-        # used
         self._shared = shared_integers(0, -1, 0, 0)
         # number of positions fetched, by worker
         self._fetched = shared_integers(*[0] * _COUNTERS)
@@ -95,7 +97,7 @@ class CurrentEpoch:
         self._followers: WeakSet[Any] = WeakSet()
 
     def __int__(self) -> int:
-        return int(self._shared[0])
+        return int(self._shared[_EPOCH])
 
     @property
     def fetched(self) -> int:
@@ -109,7 +111,7 @@ class CurrentEpoch:
             ConfigError: if Accelerate sets an epoch before the one that was set or resumed and
                 never used.
         """
-        unused = self._shared[3] == 0
+        unused = self._shared[_USED] == 0
         if (
             epoch < self.at_start
             and unused
@@ -123,9 +125,9 @@ class CurrentEpoch:
                 "from lidar_synth.integrations.accelerate import prepare; loader = "
                 "prepare(accelerator, loader).",
             )
-        self._shared[0] = epoch
+        self._shared[_EPOCH] = epoch
         self.at_start = epoch
-        self._shared[3] = 0
+        self._shared[_USED] = 0
         for loader in self._followers:
             loader.iteration = epoch
 
@@ -142,7 +144,7 @@ class CurrentEpoch:
             ConfigError: if another epoch was set since the DataLoader's pass began, or if it loads
                 a ``Subset``.
         """
-        self._shared[3] = 1
+        self._shared[_USED] = 1
         if isinstance(index, Position):
             worker = get_worker_info()
             self._fetched[worker.id % _COUNTERS if worker else 0] += 1
@@ -165,23 +167,23 @@ class CurrentEpoch:
     def note_pass(self, epoch: int) -> None:
         """Note that a pass begins, and warn once if the pass before had the same epoch; only worker
         0 does this."""
-        self._shared[3] = 1
+        self._shared[_USED] = 1
         worker = get_worker_info()
         if worker is not None and worker.id > 0:
             return
-        if self._shared[1] == epoch and not self._shared[2]:
-            self._shared[2] = 1
+        if self._shared[_PASS] == epoch and not self._shared[_WARNED]:
+            self._shared[_WARNED] = 1
             warnings.warn(REPEATED.format(epoch), stacklevel=4)
-        self._shared[1] = epoch
+        self._shared[_PASS] = epoch
 
     def forget_pass(self) -> None:
         """Forget the latest pass: the next one resumes from a state and is not a repetition."""
-        self._shared[1] = -1
+        self._shared[_PASS] = -1
         self.passed.clear()
 
     def take_pass(self, other: "CurrentEpoch") -> None:
-        """Take another mixture's latest pass for this one's, so that a repetition is noticed."""
-        self._shared[1:3] = other._shared[1:3]
+        """Adopt the latest pass of another mixture, so that a repetition is noticed."""
+        self._shared[_PASS:_USED] = other._shared[_PASS:_USED]
         self.passed = dict(other.passed)
 
     def __getstate__(self) -> dict[str, Any]:

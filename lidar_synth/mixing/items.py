@@ -23,7 +23,7 @@ class Item(dict[str, Any]):
             = 0 without boxes.
         names: M class names in KITTI's spelling.
         domain: 0 real, 1 synthetic.
-        loss_weight: by which the loss of this sample is to be multiplied.
+        loss_weight: the factor by which to multiply the loss of this sample.
         id: the scan's name.
     """
 
@@ -45,7 +45,7 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
         DataError: on a label that is not a train id.
     """
     points = np.empty((len(scan), 4), np.float32)
-    # numpy is slow at rows of three
+    # By column, because numpy copies rows of three values slowly.
     for column, values in enumerate((*scan.points.T, scan.reflectance)):
         points[:, column] = values
     if scan.label is None:
@@ -60,12 +60,10 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
                 f"train ids 0..{len(NAMES) - 1}, or {IGNORE} = ignore",
                 "Map the dataset's own ids when they are read (Taxonomy.decode).",
             )
-    own = scan.confidence
-    confidence = (
-        (label != IGNORE).astype(np.float32)
-        if own is None
-        else np.array(own, np.float32)
-    )
+    if scan.confidence is None:
+        confidence = (label != IGNORE).astype(np.float32)
+    else:
+        confidence = np.array(scan.confidence, np.float32)
     boxes: Any = (
         np.empty((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()
     )

@@ -14,11 +14,11 @@ from lidar_synth.mixing.epochs import REPEATED
 class MixedLoader(DataLoader[Any]):
     """A ``DataLoader`` of a mixture that sets its own epoch and can resume.
 
-    Each pass is one epoch, from the mixture's own or that of a loaded state on; ``set_epoch`` of
-    the loader or of the mixture chooses another. A pass that is left early is begun again by the
-    next one, with a warning unless it was left after one batch, or the scans are real ones alone:
-    passes of some batches each would train on the same ones for ever. In a distributed training
-    each rank gets its share.
+    Each pass is one epoch. The first pass is in the mixture's epoch or that of a loaded state;
+    ``set_epoch`` of the loader or of the mixture chooses another. A pass that is left early is
+    repeated by the next one from its beginning. Since passes of a few batches each would train on
+    the same batches forever, a warning says so, unless the pass was left after one batch or the
+    mixture has real scans alone. In distributed training each rank gets its share.
 
     Args:
         dataset: a ``MixedScans``.
@@ -41,15 +41,15 @@ class MixedLoader(DataLoader[Any]):
         drop_last: bool = False,
         **options: Any,
     ) -> None:
-        name = next((n for n in ("shuffle", "sampler") if options.get(n)), "in_order")
-        if name != "in_order" or not options.get(name, True):
-            raise ConfigError(
-                f"{name}={options[name]} for a loader of a mixture",
-                "batches in the plan's order, which is shuffled, as state_dict counts them",
-            )
+        for name, kept in (("shuffle", False), ("sampler", False), ("in_order", True)):
+            if bool(options.get(name, kept)) != kept:
+                raise ConfigError(
+                    f"{name}={options[name]} for a loader of a mixture",
+                    "batches in the plan's order, which is shuffled, as state_dict counts them",
+                )
         self._mixed = dataset
         self._batches: MixedBatches = dataset.batches(batch_size, drop_last=drop_last)
-        # Its epoch, and number of its batches done.
+        # Epoch of the latest pass, and number of its batches done.
         self._pass: tuple[int, int] = (dataset.epoch, 0)
         options.setdefault("collate_fn", dataset.collate)
         super().__init__(
@@ -75,11 +75,11 @@ class MixedLoader(DataLoader[Any]):
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
         epoch = self.epoch
         begun, done = self._pass
-        # After one batch, a user has looked at it; real scans alone may be for tests.
+        # Users look at one batch before training; a mixture of real scans alone may be for tests.
         if begun == epoch and done > 1 and self._mixed.synthetic:
             warnings.warn(REPEATED.format(epoch), stacklevel=2)
         self.set_epoch(epoch)
-        # Counted before each batch is yielded: a loop that takes as many batches as there are never
+        # Counted before each batch is yielded, because a loop over exactly len(self) batches never
         # asks for the end of the pass.
         for done, batch in enumerate(super().__iter__(), 1):
             self._pass = (epoch, done)

@@ -66,7 +66,7 @@ class SampleMaker:
         policy = read_policy(labels)
         self.removes_labels = isinstance(policy, RemoveLabels)
         boxes = isinstance(policy, KeepBoxes)
-        # Pasted objects with "same" are for a segmenter.
+        # PasteObjects(clear="same") is for segmenters, which need no boxes.
         boxed = boxes or getattr(policy, "clear", "same") != "same"
         self._notices = Notices(images, boxes, boxed)
         if isinstance(unboxed, str):
@@ -91,7 +91,7 @@ class SampleMaker:
         # Copied, as a source may keep its scans in memory. Scans of the town count as real here.
         scan = replace(copy_scan(scan), domain=REAL)
         if self._augment_real:
-            # A scan with pasted objects is synthetic elsewhere.
+            # Pasting marks a scan as synthetic; here it is a real sample of the plan.
             scan = replace(self._augmented(scan, rng), domain=REAL)
         return self._to_sample(scan, rng)
 
@@ -101,11 +101,11 @@ class SampleMaker:
         scan = copy_scan(scan)
         if self._transfer is not None:
             scan = self._transfer(scan, rng)
-        given = scan
-        if scan.boxes is not None:  # before labels of low confidence are ignored
+        original = scan
+        if scan.boxes is not None:  # before the policy ignores labels of low confidence
             scan = self._without_unboxed(scan)
         scan = self._policies[source](scan, rng)
-        self._notices.synthetic(given, scan)
+        self._notices.synthetic(original, scan)
         if scan.boxes is not None:
             scan = self._without_unboxed(scan)
         scan = self._augmented(scan, rng)
@@ -123,11 +123,11 @@ class SampleMaker:
         return changed
 
 
-def make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":
-    """The transfer to a sensor; None if none is given."""
-    if given is None:
+def make_transfer(target: "Transfer | Sensor | str | Path | None") -> "Transfer | None":
+    """The transfer to a sensor, which may be given as a transfer already; None for None."""
+    if target is None:
         return None
-    # only where a mixture turns its scans
+    # imported only by mixtures that change the sensor of their scans
     from lidar_synth.geometry.transfer import Transfer
 
-    return given if isinstance(given, Transfer) else Transfer(load_sensor(given))
+    return target if isinstance(target, Transfer) else Transfer(load_sensor(target))

@@ -2,9 +2,9 @@
 contradict.
 
 Two samples may have the same keys, types and shapes and still mean different things: centimetres,
-another axis, another numbering of classes. Their distributions tell. The limits of what is refused
-are far outside of what the public datasets, the town and the shipped models differ by among
-themselves (docs/how-to/mix.md).
+another axis, another numbering of classes. Their distributions show this. The limits of what is
+refused are far larger than the differences among the public datasets, the town and the shipped
+models (docs/how-to/mix.md).
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,7 +21,7 @@ from lidar_synth.geometry.projection import project
 Floats = NDArray[np.float64]
 
 LOOKED_AT = 15_000
-"""About the number of rows of a sample that are looked at."""
+"""Approximate number of rows of a sample that are measured."""
 
 QUANTILES = (0.01, 0.5, 0.99)
 
@@ -48,16 +48,15 @@ PandaSet's -2.2."""
 
 TURNED = 0.15
 SURE = 2.5
-"""Least mean elongation along an axis, and least ratio to its standard error, for a road to have a
-direction."""
+"""For roads to have a direction: minimum mean elongation along an axis (logarithm), and its minimum
+ratio to its standard error."""
 
 OTHER_SHARES = 0.5
 """Total variation distance between the shares of the classes; that of streets and motorways is up
 to 0.4."""
 
 EXPLAINED = 0.7
-"""Largest share of that distance which may remain with other numbers of the classes, if those
-explain it."""
+"""A renumbering of the classes explains that distance if it leaves less than this share of it."""
 
 LARGE = 0.03
 """Share of a class that is large enough to be recognised."""
@@ -83,7 +82,7 @@ class Table(NamedTuple):
 
 
 class Contradiction(NamedTuple):
-    """What contradicts, and whether it is certainly wrong."""
+    """A contradiction in words, and whether it is certainly an error."""
 
     text: str
     certain: bool
@@ -309,8 +308,8 @@ def _direction(along: Sequence[float]) -> int:
 def _columns(
     real: Meaning, synthetic: Meaning, coordinates: int
 ) -> Iterator[Contradiction]:
-    """Columns with another scale, or with one value only; of coordinates, ``_unit`` and
-    ``_heights`` know more."""
+    """Describe columns with another scale, or with one value only; coordinates are left to
+    ``_unit`` and ``_heights``."""
     for number in range(coordinates, len(real.quantiles)):
         name = (
             NAMES_OF_COLUMNS[number]
@@ -318,22 +317,22 @@ def _columns(
             else f"column {number}"
         )
         low, high = synthetic.quantiles[number, [0, 2]]
-        told = (
+        ranges = (
             f"{low:.4g} to {high:.4g} instead of {real.quantiles[number, 0]:.4g} to "
             f"{real.quantiles[number, 2]:.4g}"
         )
         spread = high - low
         expected = np.ptp(real.quantiles[number])
         if synthetic.constant[number] and real.varied[number]:
-            yield Contradiction(f"{name} is always {low:.4g}, {told}", number < 4)
+            yield Contradiction(f"{name} is always {low:.4g}, {ranges}", number < 4)
         elif real.constant[number] and synthetic.varied[number]:
-            yield Contradiction(f"real {name} is always the same: {told}", number < 4)
+            yield Contradiction(f"real {name} is always the same: {ranges}", number < 4)
         elif (
             min(spread, expected) > 0
             and max(spread / expected, expected / spread) > OTHER_SCALE
         ):
             yield Contradiction(
-                f"{name} is {told} (1st to 99th percentile): another scale", True
+                f"{name} is {ranges} (1st to 99th percentile): another scale", True
             )
 
 

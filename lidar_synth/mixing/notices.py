@@ -1,4 +1,4 @@
-"""Messages about what would harm a training without an error; each is logged once per dataset.
+"""Warnings about what would harm training without an error; each is logged once per dataset.
 
 Objects without boxes, real scans without boxes or labels, reflectances or numbers of points that
 tell real from synthetic, a bank used very often.
@@ -57,11 +57,11 @@ class Notices:
         self, images: bool = False, boxes: bool = False, boxed: bool = False
     ) -> None:
         self._real_boxes = boxes  # whether real scans have boxes, or should
-        # By bits, for all processes: what has been told, so that it is not in every epoch.
-        self._told = shared_integers(0)
+        # One bit for each logged message, shared by all processes, so that no epoch repeats it.
+        self._logged = shared_integers(0)
         self._names: set[str] = set()  # of all boxes
         self._boxed = boxed
-        # a real scan without labels; "" if that is no matter
+        # the id of a real scan without labels; "" if labels are not needed
         self._unlabelled: str | None = "" if boxes else None
         self._labelled = False  # whether a synthetic scan had labels
         self._images = images
@@ -93,9 +93,9 @@ class Notices:
             scan.label is None or not (scan.label != IGNORE).any()
         ):
             self._unlabelled = scan.id
-        self._count(0, scan)
+        self._compare(0, scan)
 
-    def _count(self, kind: int, scan: Scan) -> None:
+    def _compare(self, kind: int, scan: Scan) -> None:
         """Compare the numbers of points of the first scans, labelled synthetic scans with
         unlabelled real ones, and the names of boxes."""
         if scan.boxes is not None:
@@ -136,14 +136,15 @@ class Notices:
         if self._is_new(message):
             log.warning(message, *values)
 
-    def _is_new(self, what: str) -> bool:
-        """Whether this process is the one that tells it, and has not yet."""
+    def _is_new(self, message: str) -> bool:
+        """Whether this process may log, and the message has not been logged; it counts as logged
+        afterwards."""
         worker = get_worker_info()
         if worker and worker.id:
             return False
-        told = int(self._told)
-        self._told |= 1 << crc32(what.encode()) % 63
-        return int(self._told) != told
+        before = int(self._logged)
+        self._logged |= 1 << crc32(message.encode()) % 63
+        return int(self._logged) != before
 
     def lost_boxes(self, scan: Scan) -> None:
         """Report that the augmentation has removed the boxes of a scan.
@@ -162,17 +163,17 @@ class Notices:
             "background"
         )
 
-    def synthetic(self, given: Scan, scan: Scan) -> None:
+    def synthetic(self, original: Scan, scan: Scan) -> None:
         """Report the unboxed objects of a synthetic scan, or that synthetic scans have no boxes
         where real ones do.
 
         Args:
-            given: the scan before its label policy.
+            original: the scan before its label policy.
             scan: the scan with the labels and boxes of the policy.
         """
         if scan.label is not None and self._unlabelled != "":
             self._labelled = self._labelled or bool((scan.label != IGNORE).any())
-        self._count(1, scan)
+        self._compare(1, scan)
         if scan.boxes is None and self._real_boxes:
             self._warn(
                 "real scans have boxes, synthetic ones have none: a detector would learn that "
@@ -183,11 +184,11 @@ class Notices:
             return
         from lidar_synth.labels.edit import measure  # loads networks
 
-        found = measure([given])
-        if found.objects:
+        unboxed = measure([original])
+        if unboxed.objects:
             self._warn(
                 "synthetic scan %r: %s, which unboxed='close' removes; only their number is "
                 "reported with unboxed='keep'",
-                given.id,
-                found,
+                original.id,
+                unboxed,
             )

@@ -51,9 +51,9 @@ def permute(
         np.broadcast_to(np.asarray(number, np.int64), (len(entries),)).astype(np.uint64)
         + keys[-1]
     )
-    places = _once(entries.astype(np.uint64), size, keys, order)
+    places = _one_pass(entries.astype(np.uint64), size, keys, order)
     while len(outside := np.flatnonzero(places >= size)):
-        places[outside] = _once(places[outside], size, keys, order[outside])
+        places[outside] = _one_pass(places[outside], size, keys, order[outside])
     return places.astype(np.int64)
 
 
@@ -65,9 +65,10 @@ def permute_blocks(
     stream: int,
     number: int,
 ) -> NDArray[np.int64]:
-    """Apply a keyed permutation that goes through blocks of consecutive places in random order,
-    ``TOGETHER`` at a time, whose places it shuffles with one another. The remaining places, fewer
-    than so many blocks have, come last.
+    """Apply a keyed permutation that uses blocks of consecutive places at about the same time.
+
+    Blocks come in random order, ``TOGETHER`` at a time, and the places of these blocks are shuffled
+    with one another. The remaining places, too few for ``TOGETHER`` blocks, come last.
 
     Args:
         entries: (N,), 0 <= entry < size.
@@ -92,7 +93,7 @@ def permute_blocks(
     return places
 
 
-def _once(
+def _one_pass(
     cells: Words,
     size: int,
     keys: Words,

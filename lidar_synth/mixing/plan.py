@@ -196,25 +196,25 @@ class MixingPlan:
         """Ranks of synthetic samples, from the number of those before each in the epoch."""
         earlier = sum(self.before[self.reals :])
         source, number = deal(self.mixture.synthetic_weights, before + earlier)
+        source += self.reals
         rank = np.empty(len(source), np.int64)
-        for each, start in enumerate(self._starts.tolist()[self.reals :]):
+        for each, start in enumerate(self._starts.tolist()[self.reals :], self.reals):
             here = source == each
-            total = self.reals + each
-            own = number[here] - self.before[total]
-            rank[here] = start + self._ordered(total, own)
+            within = number[here] - self.before[each]
+            rank[here] = start + self._ordered(each, within)
         return rank
 
-    def _ordered(self, source: int, own: Integers) -> Integers:
-        """The order of a synthetic source's samples in the epoch; blocks begin at multiples of
-        their size."""
+    def _ordered(self, source: int, numbers: Integers) -> Integers:
+        """The places in the epoch's order of a synthetic source's samples, numbered within the
+        epoch; blocks begin at multiples of their size."""
         count = self.counts[source]
         key = (self.mixture.seed, _SOURCES + source, self.epoch)
         block = self.mixture.synthetic[source - self.reals].block
         if block == 1:
-            return permute(own, count, *key)
+            return permute(numbers, count, *key)
         first = self._local(source, np.array([self.before[source]]))
         return (
-            permute_blocks(own, count, block, *key) + int(-first[0]) % block
+            permute_blocks(numbers, count, block, *key) + int(-first[0]) % block
         ) % count
 
     def _synthetic_up_to(self, positions: Integers) -> Integers:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.mixing.schedules import Schedule, settled, share_of
+from lidar_synth.mixing.schedules import Schedule, constant_from, share_of
 
 Integers = NDArray[np.int64]
 
@@ -147,7 +147,9 @@ class Mixture:
         With ``reuse``, scans come in laps of this length, so that no epoch contains a scan twice.
         """
         most = max(ceil(exact_synthetic(self, epoch)) for epoch in self._deciding)
-        return tuple(max(1, lap) for lap in _most(_tree(self.synthetic_weights), most))
+        return tuple(
+            max(1, lap) for lap in _largest_counts(_tree(self.synthetic_weights), most)
+        )
 
     @cached_property
     def length(self) -> int:
@@ -174,19 +176,19 @@ class Mixture:
 
     @cached_property
     def _deciding(self) -> tuple[int, ...]:
-        """The epochs that are checked and that determine lengths: all until the schedule settles,
-        the first hundred if it never does."""
-        last = settled(self.ratio)
+        """The epochs that are checked and that determine lengths: all until the ratio is constant,
+        but at most the first hundred."""
+        last = constant_from(self.ratio)
         epochs = [
             *range(_FIRST_EPOCHS if last is None else min(last, _FIRST_EPOCHS)),
             last or 0,
         ]
-        found = []
+        planned = []
         with suppress(ConfigError):  # the schedule ends
             for epoch in epochs:
                 share_of(self.ratio, epoch)
-                found.append(epoch)
-        return tuple(found)
+                planned.append(epoch)
+        return tuple(planned)
 
     @cached_property
     def _sums(self) -> dict[int, Fraction]:
@@ -221,7 +223,7 @@ def exact_synthetic(mixture: Mixture, epoch: int) -> Fraction:
 def synthetic_before(mixture: Mixture, epoch: int) -> Fraction:
     """The number of synthetic samples that all epochs before this one should have together, before
     rounding."""
-    same_from = settled(mixture.ratio)
+    same_from = constant_from(mixture.ratio)
     changing = epoch if same_from is None else min(epoch, same_from)
     sums = mixture._sums
     for earlier in range(len(sums) - 1, changing):
@@ -325,7 +327,7 @@ def _left(node: _Node, count: Number) -> Number:
     return quotient * node.p + (2 * rest * node.p + node.q) // (2 * node.q)
 
 
-def _most(node: _Node | int, count: int) -> tuple[int, ...]:
+def _largest_counts(node: _Node | int, count: int) -> tuple[int, ...]:
     """The largest number of samples that each source, in order, can get out of ``count``
     consecutive ones."""
     most: dict[int, int] = {}

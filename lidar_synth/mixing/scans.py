@@ -50,8 +50,8 @@ Ratio = float | Sequence[float] | Mapping[int, float] | Schedule
 """The share of synthetic samples in [0, 1], see ``make_schedule``."""
 
 _LATEST: WeakValueDictionary[str, Any] = WeakValueDictionary()
-"""By the hash of epoch 0: the mixture that was made last. One that is made anew before each epoch
-repeats it."""
+"""{hash of the plan of epoch 0: the latest mixture with that plan}. It shows that a mixture is made
+anew before each epoch, which repeats epoch 0."""
 
 
 class MixedScans(Dataset[Any]):
@@ -77,7 +77,7 @@ class MixedScans(Dataset[Any]):
             {argument: value}}``, or your own ``(scan, rng) -> scan``.
         loss_weight: weight of the synthetic samples in the loss, from 0 to 1: a number, or one by
             epoch as for ``ratio``. Items and batches have it as ``loss_weight``; ``Sources`` may
-            have one for each source. The training multiplies.
+            have one for each source. Your training loop multiplies the losses by it.
         seed: of the order, of all random numbers of a sample, and of a generator's scans.
         epoch_size: the length of every epoch. ``"add"`` uses every real scan once and adds
             synthetic ones, as many as the largest ratio of a schedule needs; where the ratio is
@@ -94,22 +94,22 @@ class MixedScans(Dataset[Any]):
         augment_real: whether to apply ``augment`` to real scans too; otherwise they stay unchanged,
             bit for bit.
         to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py).
-            The scan is a copy, which it and the trainer may change in place. Into a dict with the
-            key ``loss_weight`` the weight of the plan is written; others are refused if a weight
-            is not 1.
+            The scan is a copy, which it and the trainer may change in place. If the sample is a
+            dict with the key ``loss_weight``, the weight is written there; other samples are
+            refused if a weight is not 1.
         collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"``
             (collate.py), or your own function.
         unlabelled: ``"error"`` refuses a batch without any valid label; ``"allow"`` returns it,
             which is always the case with ``labels="none"``.
         unboxed: what is done to objects without a box in synthetic scans with boxes: ``"close"``
-            removes them and fills the holes, ``"keep"`` hands them out, ``"error"`` refuses the
-            scan; or your own ``(scan) -> scan``. A detector would learn that they are background. A
-            scan without boxes is not changed.
+            removes them and fills the holes, ``"keep"`` keeps them, from which a detector would
+            learn that such objects are background, ``"error"`` refuses the scan; or your own
+            ``(scan) -> scan``. A scan without boxes is not changed.
         as_sensor: turns every synthetic scan into one of this sensor, before the label policy and
             in the process that loads the sample: a ``Transfer``, a preset's name, a YAML file or a
-            ``Sensor``. So a bank of one sensor serves the scans of another. Losses and noise are
-            new for every position of an epoch. Real scans stay unchanged; ``SeenAs(real,
-            transfer)`` turns those into scans of another sensor.
+            ``Sensor``. A bank of one sensor can thus be mixed with scans of another. Lost returns
+            and noise are drawn anew at every position of an epoch. Real scans stay unchanged;
+            ``SeenAs(real, transfer)`` turns those into scans of another sensor.
         real_as_is: whether real samples are returned unchanged, because they are not ``Scan`` but
             already have the trainer's form; see ``wrap``.
         compare: whether to refuse weights that samples have no key for, and with ``real_as_is`` to
@@ -223,10 +223,10 @@ class MixedScans(Dataset[Any]):
         self.collate: Callable[[Any], Any] = collate
         self.current = CurrentEpoch()
         self._planned: tuple[int, MixingPlan] | None = None
-        # Whether it is made as an earlier one was, and no epoch has been set.
-        self._untold = False
+        # Whether this mixture continues an earlier one with the same plan; until set_epoch.
+        self._continues = False
         self.set_epoch(0)
-        self._untold = self._take_earlier()
+        self._continues = self._take_earlier()
         self._weighs = compare and (
             self.synthetic_weight != make_weight(1) or set(self._loss_weights) != {1}
         )
@@ -234,7 +234,7 @@ class MixedScans(Dataset[Any]):
             check_alike(self.real, self.synthetic, self._maker.synthetic, self._weighs)
 
     def _take_earlier(self) -> bool:
-        """Take the pass of the latest mixture with the same plan, if there is one."""
+        """Adopt the pass of the latest mixture with the same plan; whether there is one."""
         first = MixingPlan(self.mixture, 0)
         report_repeats(first)
         earlier = _LATEST.get(first.hash)
@@ -264,7 +264,8 @@ class MixedScans(Dataset[Any]):
         Args:
             dataset: has ``__len__`` and ``__getitem__``; or ``Sources`` of several.
             synth, ratio: as for ``MixedScans``.
-            epochs: of a segmenter's training, in the place of ``ratio``: the recipe of ``mix``.
+            epochs: number of epochs of a segmenter's training, instead of ``ratio``; chooses the
+                recipe of ``mix``.
             to_sample: ``(scan, rng) -> sample`` gives a synthetic scan the form of ``dataset``'s
                 samples.
             collate: the trainer's own collate function.
@@ -287,23 +288,23 @@ class MixedScans(Dataset[Any]):
             >>> [train[i].shape[1] for i in range(len(train))]
             [3, 3, 3, 3]
         """
-        own: dict[str, Any] = {"ratio": 0.25 if ratio is None else ratio}
+        defaults: dict[str, Any] = {"ratio": 0.25 if ratio is None else ratio}
         if epochs is not None:
-            # It imports all that pastes objects.
+            # imported here, because it loads the modules that paste objects
             from lidar_synth.mixing.defaults import segmentation_options
 
             transfer = make_transfer(options.get("as_sensor"))
             alike = transfer is None or agree(
                 Sensor.same_lasers, transfer.target, synth
             )
-            own |= segmentation_options(dataset, epochs, ratio, alike)
+            defaults |= segmentation_options(dataset, epochs, ratio, alike)
         return cls(
             dataset,
             synth,
             to_sample=to_sample,
             collate=collate,
             real_as_is=True,
-            **(own | options),
+            **(defaults | options),
         )
 
     def __getattr__(self, name: str) -> Any:
@@ -348,8 +349,8 @@ class MixedScans(Dataset[Any]):
                 f"loss_weight= that gives no weight from 0 to 1 in epoch {epoch}",
                 "one for every epoch, or {epoch: weight}, whose last weight stays",
             ) from error
-        if self._untold:
-            self._untold = False
+        if self._continues:
+            self._continues = False
             self.current.forget_pass()
         self.current.set(epoch)
         if get_worker_info() is None:
@@ -460,8 +461,12 @@ class MixedScans(Dataset[Any]):
             return weight
         return weight * float(share_of(self.synthetic_weight, plan.epoch))
 
-    def _weighed(self, sample: Any, plan: MixingPlan, position: int) -> Any:
-        """The sample, with its weight if it is a plain item or a dict with the item's values."""
+    def _with_weight(self, sample: Any, plan: MixingPlan, position: int) -> Any:
+        """The sample, with its loss weight if it is a dict with that key.
+
+        Raises:
+            ConfigError: if the mixture has loss weights and the sample has no such key.
+        """
         if isinstance(sample, dict) and "loss_weight" in sample:
             sample["loss_weight"] = self._weight_of(plan, position)
         elif self._weighs:
@@ -491,7 +496,7 @@ class MixedScans(Dataset[Any]):
         if self._real_as_is:
             return real
         rng = keyed_rng(self.seed, epoch, position)
-        return self._weighed(self._maker.real(real, rng), plan, position)
+        return self._with_weight(self._maker.real(real, rng), plan, position)
 
     def finish(self, scan: Scan, epoch: int, position: int) -> Any:
         """Make the sample of a synthetic scan at its position: sensor, label policy, augmentation,
@@ -502,7 +507,9 @@ class MixedScans(Dataset[Any]):
         plan = self.plan(epoch)
         rng = keyed_rng(self.seed, epoch, position)
         source = plan[position][0] - plan.reals
-        return self._weighed(self._maker.synthetic(source, scan, rng), plan, position)
+        return self._with_weight(
+            self._maker.synthetic(source, scan, rng), plan, position
+        )
 
     def batches(
         self,
@@ -555,7 +562,7 @@ class MixedScans(Dataset[Any]):
 def _plan_synthetic(
     source: Any, weight: float | None, transfer: "Transfer | None", by_shard: bool
 ) -> PlannedSource:
-    """What the plan has to know of a synthetic source."""
+    """The properties of a synthetic source that determine the plan."""
     suffix = "" if transfer is None else f" as {transfer.identity}"
     return PlannedSource(
         source.length,

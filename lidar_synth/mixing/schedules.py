@@ -102,19 +102,19 @@ class Linear:
 
 @dataclass(frozen=True)
 class SyntheticFirst:
-    """Synthetic scans alone in three quarters of the epochs, then beside real ones, and real scans
-    alone in the last twentieth, whose statistics batch normalisation then has.
+    """Synthetic scans alone for three quarters of the epochs, then both kinds, and real scans alone
+    in the last twentieth.
 
-    This schedule gained most where labelled scans are few (docs/research/proof.md,
-    docs/research/detectors.md).
+    After the last epochs, batch normalisation has the statistics of real scans. This schedule
+    gained most where labelled scans are few (docs/research/proof.md, docs/research/detectors.md).
 
     Args:
-        epochs: number of epochs of the training, at least 4; with fewer than 20 none is of real
-            scans alone: ``settle`` the network.
-        share: of synthetic samples beside real ones, in [0, 1].
+        epochs: number of epochs of the training, at least 4. With fewer than 20, no epoch has real
+            scans alone: ``settle`` the network afterwards.
+        share: share of synthetic samples in the epochs with both kinds, in [0, 1].
 
     Raises:
-        ConfigError: on fewer epochs, or another share.
+        ConfigError: on fewer than 4 epochs, or a share outside [0, 1].
 
     Example:
         >>> from lidar_synth.mixing import SyntheticFirst
@@ -222,7 +222,7 @@ def check_epochs(epochs: int) -> None:
         raise ConfigError(f"{epochs} epochs of a schedule", "at least 4")
 
 
-def settled(schedule: Schedule) -> int | None:
+def constant_from(schedule: Schedule) -> int | None:
     """The epoch from which on a schedule is constant; None if unknown."""
     return getattr(schedule, "constant_from", None)
 

@@ -67,38 +67,40 @@ def open_synthetic(where: Any) -> Any:
     if is_url(where):
         return Bank(where)
     if not os.path.isdir(where):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
-        # It loads networks: only where a model is named.
+        # imported only if a model is named, because it loads networks
         from lidar_synth.generate.loading import load_generator
 
         return load_generator(where)
     if is_bank(where):
         return Bank(where)
     scans = open_scans(where)
-    own = scans[0].sensor  # files may store their own sensor
-    return scans if scans.sensor.shape == own.shape else open_scans(where, sensor=own)
+    stored = scans[0].sensor  # files may store their own sensor
+    if scans.sensor.shape == stored.shape:
+        return scans
+    return open_scans(where, sensor=stored)
 
 
-def read_settings(given: Any = None) -> dict[str, Any]:
+def read_settings(settings: Any = None) -> dict[str, Any]:
     """Read the settings of a mixture, with keys in lower case.
 
     Args:
-        given: the settings or a YAML file; by default the file in the environment variable
+        settings: the settings or a YAML file; by default the file in the environment variable
             ``LIDAR_SYNTH_MIX``.
 
     Raises:
         ConfigError: if there are no settings.
         FileError, DataError: if the file cannot be read.
     """
-    source = given if given is not None else os.environ.get(VARIABLE)
+    source = settings if settings is not None else os.environ.get(VARIABLE)
     if isinstance(source, str | Path):
-        given = read_yaml(Path(source), "the settings of a mixture")
-    if not isinstance(given, Mapping):
+        settings = read_yaml(Path(source), "the settings of a mixture")
+    if not isinstance(settings, Mapping):
         raise ConfigError(
             f"{source!r} as the settings of a mixture",
             f"a dict of {', '.join(OPTIONS)}, or a YAML file of them",
             f"Set the file in the trainer's configuration or by {VARIABLE}=mix.yaml.",
         )
-    return {str(key).lower(): value for key, value in given.items()}
+    return {str(key).lower(): value for key, value in settings.items()}
 
 
 def mix(
@@ -122,16 +124,16 @@ def mix(
             task.
         task: "segmentation", or "detection", which needs ``epochs``, takes boxes as labels, and
             pastes objects of the real scans into all scans, which it turns, mirrors and scales.
-        epochs: of the training. With it the recipe that gained on real scans is the default. With
-            up to 40 real scans of the synthetic scans' lasers: synthetic scans alone in three
-            quarters of the epochs, then half, real ones alone in the last twentieth; persons and
-            cycles of the town take the place of the synthetic scans' own, unless ``labels`` are
-            given. Otherwise: synthetic scans alone in a quarter of the epochs, then real ones
-            alone.
-        as_sensor: ``"auto"`` turns synthetic scans into scans of the real scans' sensor if theirs
-            is another, and where its lasers are others gives them the distribution of
-            reflectance of ten real scans; None leaves them as they are; otherwise as for
-            ``MixedScans``, or ``{"sensor": NAME, "mount": [Z, PITCH], "like": FOLDER}``.
+        epochs: number of epochs of the training; makes the recipe that gained most on real scans
+            the default. With up to 40 real scans whose sensor has the lasers of the synthetic
+            scans': synthetic scans alone for three quarters of the epochs, then half of the
+            samples, and real scans alone in the last twentieth; persons and cycles of the town
+            replace those of the synthetic scans, unless ``labels`` are given. Otherwise: synthetic
+            scans alone for a quarter of the epochs, then real scans alone.
+        as_sensor: ``"auto"`` turns synthetic scans into scans of the real scans' sensor if they
+            are of another one; if its lasers differ too, they get the distribution of reflectance
+            of ten real scans. None leaves them as they are; otherwise as for ``MixedScans``, or
+            ``{"sensor": NAME, "mount": [Z, PITCH], "like": FOLDER}``.
         options: further arguments of ``MixedScans``.
 
     Raises:
@@ -155,35 +157,36 @@ def mix(
         as_sensor = _transfer(reals, synthetics, alike)
     as_sensor = read_transfer(as_sensor, synthetics)
     choose("task", task, dict.fromkeys(TASKS))
-    own = {}
+    recipe = {}
     if task == "detection":
-        own = detection_options(reals, epochs)
+        recipe = detection_options(reals, epochs)
     elif epochs is not None:
-        own = segmentation_options(reals, epochs, ratio, alike)
+        recipe = segmentation_options(reals, epochs, ratio, alike)
         for source, _ in each(reals):
-            if own and source[0].label is None:
+            if recipe and source[0].label is None:
                 raise ConfigError(
                     f"epochs={epochs} with a source of real scans without labels",
                     "labelled scans, or synthetic ones alone: ratio=1.0, epoch_size=400",
                     "Then settle the network on the real scans (docs/how-to/mix.md).",
                 )
     given = {"ratio": ratio, "labels": _open_policy(labels), "as_sensor": as_sensor}
-    own |= {name: value for name, value in given.items() if value is not None}
+    recipe |= {name: value for name, value in given.items() if value is not None}
     known = dict(inspect.signature(MixedScans).parameters, epochs=0, task=0)
     del known["real_as_is"]
     for name in options:
         choose("argument of mix", name, known)
-    return MixedScans(reals, synthetics, **(own | options))
+    return MixedScans(reals, synthetics, **(recipe | options))
 
 
 def _transfer(reals: Any, synthetics: Any, alike: bool) -> Transfer | None:
-    """Turns synthetic scans into scans of the real ones' sensor; None if they are. Scans of other
-    lasers, not ``alike``, get the distribution of the real scans' reflectance."""
+    """The transfer of synthetic scans to the sensor of the real ones; None if it is the same.
+    Unless the lasers are ``alike``, the transfer also adapts the reflectance to real scans."""
     if agree(Sensor.same_grid, reals, synthetics):
         return None
     [real, _], *_ = each(reals)
-    [made, _], *_ = each(synthetics)
-    return make_transfer(sensor_of(real), (0.0, 0.0), None if alike else real, made)
+    [synthetic, _], *_ = each(synthetics)
+    like = None if alike else real
+    return make_transfer(sensor_of(real), (0.0, 0.0), like, synthetic)
 
 
 def _open_real(where: Any) -> Any:
@@ -256,7 +259,7 @@ def mix_for_trainer(
     options["as_sensor"] = read_transfer(options.get("as_sensor"), synthetic)
     if "labels" in options:
         options["labels"] = _open_policy(options["labels"])
-    # Numbers, no samples.
+    # compare=False: the real samples are only numbers.
     return MixedScans.wrap(
         range(real), synthetic, to_sample=to_sample, compare=False, **options
     )
@@ -266,9 +269,8 @@ def _open_policy(labels: Any) -> Any:
     """A label policy with its real scans, which YAML names by their folder."""
     if not isinstance(labels, Mapping):
         return labels
-    return {
-        name: {**given, "real": _open_real(given["real"])}
-        if isinstance(given, Mapping) and "real" in given
-        else given
-        for name, given in labels.items()
-    }
+    policies = dict(labels)
+    for name, arguments in labels.items():
+        if isinstance(arguments, Mapping) and "real" in arguments:
+            policies[name] = {**arguments, "real": _open_real(arguments["real"])}
+    return policies

@@ -21,8 +21,8 @@ class Sources:
         weights: one for each source; its number of samples in an epoch is proportional to its
             weight. By default the weight of a real source is its length, and synthetic sources have
             equal weights.
-        loss_weights: one for each source, from 0 to 1, by which the loss of its samples is to be
-            multiplied; by default 1.
+        loss_weights: for each source the factor, from 0 to 1, by which to multiply the loss of its
+            samples; by default 1.
 
     Raises:
         ConfigError: without a source, on another number of weights, or on loss weights that are
@@ -105,8 +105,8 @@ def first_of(source: Any) -> Scan:
 
 
 def sensor_of(source: Any) -> Sensor:
-    """The sensor of a source of scans: its attribute ``sensor``, or the sensor of its first scan,
-    see ``first_of``; or the sensor that is given."""
+    """The sensor of a source of scans: its attribute ``sensor``, or else that of its first scan,
+    see ``first_of``. A sensor is returned as it is."""
     sensor = getattr(source, "sensor", source)
     return sensor if isinstance(sensor, Sensor) else first_of(source).sensor
 
@@ -115,7 +115,7 @@ def agree(rule: Callable[[Sensor, Sensor], bool], reals: Any, synthetics: Any) -
     """Whether a rule holds for the sensors of each real and each synthetic source."""
     pairs = product(each(reals), each(synthetics))
     return all(
-        rule(sensor_of(some), sensor_of(other)) for (some, _), (other, _) in pairs
+        rule(sensor_of(real), sensor_of(synth)) for (real, _), (synth, _) in pairs
     )
 
 

@@ -24,8 +24,8 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
     """This process's rank and the number of ranks.
 
     Args:
-        rank, world_size: returned if given. The default is that of ``torch.distributed``, or before
-            it is initialised the environment variables of torchrun (``RANK``, ``WORLD_SIZE``), or
+        rank, world_size: returned if given. The default is that of ``torch.distributed`` if it is
+            initialised, else that of torchrun's environment variables (``RANK``, ``WORLD_SIZE``),
             else 0 of 1.
 
     Raises:
@@ -54,20 +54,22 @@ def count_accelerated() -> int:
 
 
 class Divided:
-    """What is divided among ranks. ``Accelerator`` may divide batches among the same processes a
-    second time."""
+    """Base class of batches and streams that are divided among ranks.
+
+    Default ranks are refused where an ``Accelerator`` may divide the batches among the same
+    processes a second time."""
 
     call: str
-    """What was called, for an error."""
+    """The call that makes the object, for error messages."""
     rank: int
     world_size: int
-    _by_default: bool
+    _default_rank: bool
 
     def divide(self, rank: int | None, world_size: int | None) -> None:
         """Change the rank of this process and the number of ranks, before iterating; arguments as
         of ``place``."""
         self.rank, self.world_size = place(rank, world_size)
-        self._by_default = rank is None
+        self._default_rank = rank is None
 
     def _check(self) -> None:
         """Refuse default ranks.
@@ -75,7 +77,7 @@ class Divided:
         Raises:
             ConfigError: if an ``Accelerator`` is set up for several processes.
         """
-        if self._by_default and self.world_size > 1 and count_accelerated() > 1:
+        if self._default_rank and self.world_size > 1 and count_accelerated() > 1:
             raise ConfigError(
                 f"{self.call} with the default rank {self.rank} of {self.world_size} and an "
                 "Accelerator, which divides prepared loaders among the same processes again: most "

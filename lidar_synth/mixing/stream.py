@@ -9,7 +9,13 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.labels.own import check_count
-from lidar_synth.mixing.batches import AHEAD, CutSteps, cut_steps, go_to, rank_share
+from lidar_synth.mixing.batches import (
+    AHEAD,
+    CutSteps,
+    cut_steps,
+    rank_share,
+    resume_epoch,
+)
 from lidar_synth.mixing.epochs import check_pass, share, shared_integers
 from lidar_synth.mixing.scans import MixedScans
 from lidar_synth.mixing.state import (
@@ -82,11 +88,11 @@ class MixedStream(Divided, IterableDataset[Any]):
         self._process = os.getpid()  # the process that has iterated last
         self._start = shared_integers(0, 0)  # epoch and position of the loaded state
         # samples that this process has yielded since it began to iterate
-        self._given = 0
+        self._yielded = 0
         self._begun: tuple[int, int] | None = None  # epoch and position where it began
         # the state from which the process that loaded it has to resume
         self._resume: dict[str, Any] = {}
-        self._loaded_by = 0  # that process
+        self._loaded_by = 0  # the id of that process
 
     def __repr__(self) -> str:
         kind = "endless" if self.endless else "epoch by epoch"
@@ -108,13 +114,13 @@ class MixedStream(Divided, IterableDataset[Any]):
                 "the same ranks, workers and batch size",
                 "state_dict(done=...) makes a state that fits any number of ranks and workers.",
             )
-        again = self._process == os.getpid() and get_worker_info() is not None
+        persistent = self._process == os.getpid() and get_worker_info() is not None
         self._begun = (epoch, position)
-        self._given = given
+        self._yielded = given
         self._resume = {}
         self._process = os.getpid()
         self.scans.current.note_pass(epoch)
-        return self._samples(epoch, position, again and not self.endless)
+        return self._samples(epoch, position, persistent and not self.endless)
 
     def _samples(self, begin: int, position: int, guarded: bool) -> Iterator[Any]:
         """The samples of this process.
@@ -127,11 +133,11 @@ class MixedStream(Divided, IterableDataset[Any]):
         place = self._place()
         worker = place["worker"]
         batches = islice(self._batches(begin, position), worker, None, place["workers"])
-        # First: the number of the epoch's first sample.
+        # Samples are numbered from where the pass began.
         epoch = begin
-        first = -position
+        first = -position  # number of the epoch's first sample
         announced = 0
-        for number in islice(chain.from_iterable(batches), self._given, None):
+        for number in islice(chain.from_iterable(batches), self._yielded, None):
             if guarded:
                 check_pass(begin, self.scans.epoch)
             while number >= (end := first + len(self.scans)):
@@ -147,7 +153,7 @@ class MixedStream(Divided, IterableDataset[Any]):
                     (n - first for n in takewhile(end.__gt__, ahead) if n >= number),
                 )
                 announced = min(end, number + AHEAD * self.world_size // 2)
-            self._given += 1
+            self._yielded += 1
             yield self.scans.sample(epoch, number - first)
 
     def state_dict(self, done: int | None = None) -> dict[str, Any]:
@@ -197,7 +203,7 @@ class MixedStream(Divided, IterableDataset[Any]):
             # since.
             self._start[0] = epoch
             self._start[1] = position
-            go_to(self.scans, epoch, position)
+            resume_epoch(self.scans, epoch, position)
 
     def _progress(self) -> tuple[int, int, int]:
         """Epoch and position where iteration began, or would begin, and the number of samples
@@ -206,7 +212,7 @@ class MixedStream(Divided, IterableDataset[Any]):
         if self._begun is not None and (
             in_worker or self._begun[0] == self.scans.epoch
         ):
-            return *self._begun, self._given
+            return *self._begun, self._yielded
         if in_worker and self._resume and self._loaded_by == os.getpid():
             return (
                 self._resume["epoch"],

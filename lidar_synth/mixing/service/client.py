@@ -24,7 +24,7 @@ class Client:
     """A generator process, as used by its parent process and the parent's workers.
 
     Args:
-        plan: the job of the process.
+        job: what the process is to do.
         slots: the shared memory that it fills.
         timeout: maximum seconds of a wait.
 
@@ -36,7 +36,7 @@ class Client:
         ProcessError: if the process does not start; the message names the reason.
     """
 
-    def __init__(self, plan: GeneratorJob, slots: Slots, timeout: float) -> None:
+    def __init__(self, job: GeneratorJob, slots: Slots, timeout: float) -> None:
         if current_process().daemon:
             raise ConfigError(
                 "a rolling bank made inside a worker process",
@@ -44,16 +44,16 @@ class Client:
             )
         self.timeout = timeout
         self._slots = slots
-        self._secret = plan.secret
+        self._secret = job.secret
         # by process and thread
         self._connections: dict[tuple[int, int], Connection] = {}
         context = get_context("spawn")
-        started, end = context.Pipe(duplex=False)
+        started, sender = context.Pipe(duplex=False)
         self._process = context.Process(
-            target=run, args=(plan, slots, end), name="lidar-synth", daemon=True
+            target=run, args=(job, slots, sender), name="lidar-synth", daemon=True
         )
         self._process.start()
-        end.close()
+        sender.close()
         self._owner = os.getpid()
         self.pid = self._process.pid or 0
         self._end = weakref.finalize(self, _end, self._process, self._owner)
@@ -93,7 +93,7 @@ class Client:
         finally:
             # a late answer must not be taken for that of another request
             if not answered:
-                self._connections.pop(_here(), None)
+                self._connections.pop(_thread_key(), None)
 
     def tell(self, *request: int) -> None:
         """Send a request that has no answer; raises ``OSError`` if the process has died."""
@@ -115,16 +115,16 @@ class Client:
     def _line(self) -> Connection:
         """This thread's own connection; a forked process must not use the ones inherited from its
         parent."""
-        if _here() not in self._connections:
+        if _thread_key() not in self._connections:
             if os.getpid() == self._owner and not self._end.alive:
                 raise ConfigError("a rolling bank that is closed", "an open one")
             for inherited in [
                 key for key in self._connections if key[0] != os.getpid()
             ]:
                 del self._connections[inherited]
-            line = self._connections[_here()] = connection.Client(self._address)
+            line = self._connections[_thread_key()] = connection.Client(self._address)
             line.send_bytes(self._secret)
-        return self._connections[_here()]
+        return self._connections[_thread_key()]
 
     def _died(self, hint: str = "") -> ProcessError:
         code = ""
@@ -152,7 +152,7 @@ class Client:
         )
 
 
-def _here() -> tuple[int, int]:
+def _thread_key() -> tuple[int, int]:
     return os.getpid(), threading.get_ident()
 
 

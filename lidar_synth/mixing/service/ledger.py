@@ -163,12 +163,13 @@ class Ledger:
     def _claim(self, most: int) -> Iterator[Slot]:
         for _ in range(most):
             awaited = next((n for n in self._awaited if n not in self._slots), None)
+            # An awaited scan comes before all predicted ones.
             wanted = (
                 self._outlook.upcoming(self._slots)
                 if awaited is None
                 else (-1.0, awaited)
             )
-            slot = None if wanted is None else self._room(wanted[0])
+            slot = None if wanted is None else self._to_overwrite(wanted[0])
             if wanted is None or slot is None:
                 return
             del self._slots[slot.number]
@@ -178,12 +179,12 @@ class Ledger:
             self._slots[slot.number] = slot
             yield slot
 
-    def _use(self, slot: Slot) -> float:
+    def _next_use(self, slot: Slot) -> float:
         if slot.number >= 0:
             return self._outlook.next_use(slot.number, slot.served)
         return NEVER
 
-    def _room(self, use: float) -> Slot | None:
+    def _to_overwrite(self, use: float) -> Slot | None:
         """The slot to overwrite for a scan with this use: the oldest that is not needed, or the one
         needed last."""
         idle = [
@@ -191,7 +192,7 @@ class Ledger:
             for s in self._slots.values()
             if s.ready and not s.lent and s.number not in self._awaited
         ]
-        last = next((s for s in idle if self._use(s) == NEVER), None) or max(
-            idle, key=self._use, default=None
+        last = next((s for s in idle if self._next_use(s) == NEVER), None) or max(
+            idle, key=self._next_use, default=None
         )
-        return last if last and self._use(last) > use else None
+        return last if last and self._next_use(last) > use else None

@@ -76,11 +76,11 @@ def receive(connection: Connection) -> list[int]:
     return values
 
 
-def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
+def run(job: GeneratorJob, slots: Slots, started: Connection) -> None:
     """The main function of the process; it never returns.
 
     Args:
-        plan: the job.
+        job: what the process is to do.
         slots: the shared memory to fill.
         started: the pipe to which the address is sent once the model is loaded.
     """
@@ -88,19 +88,17 @@ def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_watch_parent, daemon=True).start()
     try:
-        if plan.threads:
-            torch.set_num_threads(plan.threads)
-        generator = load_generator(plan.model, **plan.options)
-        ledger = Ledger(slots.count, slots.counters, plan.starved, plan.replaced)
+        if job.threads:
+            torch.set_num_threads(job.threads)
+        generator = load_generator(job.model, **job.options)
+        ledger = Ledger(slots.count, slots.counters, job.starved, job.replaced)
         # Linux: an abstract socket name, which has no file and disappears with the process.
         name = f"\0lidar-synth-{token_hex(16)}" if sys.platform == "linux" else None
         listener = Listener(name, backlog=128)
-        Thread(
-            target=_accept, args=(listener, plan.secret, ledger), daemon=True
-        ).start()
+        Thread(target=_accept, args=(listener, job.secret, ledger), daemon=True).start()
         started.send_bytes((name or str(listener.address)).encode())
         while True:
-            _make(generator, plan, ledger.claim(generator.batch), slots, ledger)
+            _make(generator, job, ledger.claim(generator.batch), slots, ledger)
     except BaseException as error:
         slots.last_words = f"{type(error).__name__}: {error}"
         if not isinstance(error, LidarSynthError):
@@ -110,13 +108,13 @@ def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
 
 def _make(
     generator: Generator,
-    plan: GeneratorJob,
+    job: GeneratorJob,
     claimed: Sequence[Slot],
     slots: Slots,
     ledger: Ledger,
 ) -> None:
     images = generator.range_images(
-        plan.seed, [slot.number for slot in claimed], **plan.sampling
+        job.seed, [slot.number for slot in claimed], **job.sampling
     )
     for slot, image in zip(claimed, images, strict=True):
         ledger.publish(slot, slots.write(slot.place, slot.number, image))

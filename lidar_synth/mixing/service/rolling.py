@@ -132,7 +132,7 @@ class RollingBank:
         self._name = f"{path.stem}/{seed}"
         self._provenance = model_provenance(path.stem, checksum, seed)
         self._slots = Slots(Encoding(self.sensor, channels), slots + replaced)
-        plan = GeneratorJob(
+        job = GeneratorJob(
             path,
             seed,
             starved,
@@ -141,7 +141,7 @@ class RollingBank:
             options,
             {"steps": steps, "solver": solver},
         )
-        self._client = Client(plan, self._slots, timeout)
+        self._client = Client(job, self._slots, timeout)
 
     @property
     def pid(self) -> int:
