@@ -17,7 +17,7 @@ TOLERANCE = 0.1
 """Metres outside a box within which a point belongs to it."""
 
 FIELDS = frozenset(("boxes", "instance"))
-"""What the scans of a layout have besides those of other models."""
+"""Fields that only scans conditioned on a layout have."""
 
 
 @runtime_checkable
@@ -25,24 +25,24 @@ class Drawer(Protocol):
     """Objects that can be cast into a scan, such as those of ``ObjectBank.from_town``."""
 
     def draw(self, scan: Scan, boxes: Boxes) -> Scan:
-        """The scan whose objects are those of some boxes, cast there."""
+        """The scan with objects cast at the boxes (M) in the place of its own."""
         ...
 
 
-def boxes_of(given: Any, count: int) -> list[Boxes] | None:
-    """The boxes of the layouts of ``count`` scans; None where conditions are images, which do not
-    tell them.
+def boxes_of(condition: Any, count: int) -> list[Boxes] | None:
+    """The boxes of the layouts that condition ``count`` scans; None if one of them is an image,
+    whose boxes are not known.
 
     Args:
-        given: the argument ``condition`` of ``Generator.range_images``.
+        condition: as for ``Generator.range_images``.
         count: number of scans.
 
     Raises:
         DataError: on layouts and images together.
     """
-    if isinstance(given, Mapping):
-        given = given.get("layout")
-    each = list(given) if isinstance(given, Sequence) else [given] * count
+    if isinstance(condition, Mapping):
+        condition = condition.get("layout")
+    each = list(condition) if isinstance(condition, Sequence) else [condition] * count
     each = [one.get("layout") if isinstance(one, Mapping) else one for one in each]
     known = [isinstance(one, Scan | Layout) and one.boxes is not None for one in each]
     if any(known) and not all(known):
@@ -59,8 +59,8 @@ def boxes_of(given: Any, count: int) -> list[Boxes] | None:
 
 
 def add_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
-    """An image with those boxes that hold a return, and the channel ``instance``: 1 for the returns
-    in the first of them, and so on; 0 = none. Returns of the ground belong to no box."""
+    """An image with the boxes that hold a return, and the channel ``instance``: n for returns in
+    box n of these, counted from 1; 0 = none. Returns of the ground belong to no box."""
     scan = unproject(image)
     inside = boxes.enlarged(TOLERANCE).contain(scan.points)
     if scan.label is not None:
@@ -76,10 +76,10 @@ def add_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
 
 
 def draw_boxes(image: RangeImage, boxes: Boxes, objects: Drawer) -> RangeImage:
-    """An image whose objects are cast: those of a bank, at boxes; with the boxes that are seen, and
+    """An image with the objects of a bank cast at the boxes; it gets the boxes that are seen, and
     the channel ``instance``."""
-    drawn = objects.draw(unproject(image), boxes)
-    made = project(drawn, channels=[*image.channels, "instance"])
-    assert drawn.boxes is not None
-    seen = np.isin(drawn.boxes.instance, made.channels["instance"])
-    return replace(made, boxes=drawn.boxes[seen])
+    scan = objects.draw(unproject(image), boxes)
+    drawn = project(scan, channels=[*image.channels, "instance"])
+    assert scan.boxes is not None
+    seen = np.isin(scan.boxes.instance, drawn.channels["instance"])
+    return replace(drawn, boxes=scan.boxes[seen])

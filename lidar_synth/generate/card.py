@@ -16,12 +16,12 @@ def model_card(
 
     Args:
         place: where the model will be, ``hf://user/model``.
-        header: of its checkpoint.
-        digest: hash of its checkpoint.
-        parameters: number of them.
-        licence: an identifier of the hub; None = that of the header.
+        header: the header of its checkpoint.
+        digest: the hash of its checkpoint.
+        parameters: number of the model's parameters.
+        licence: an identifier of the hub; None = the licence of the header.
     """
-    made = header.provenance
+    provenance = header.provenance
     condition = next(iter(header.conditioning), None)
     rows, columns = header.sensor.shape
     name = place.rpartition("/")[2]
@@ -31,15 +31,15 @@ def model_card(
         "condition": condition or "none",
         "steps": len(header.time_grid) - 1,
         "parameters": f"{parameters / 1e6:.1f} M",
-        "licence": licence or made["licence"],
-        "data": made["data"],
-        "data licence": made["data_licence"],
-        "recordings": seen_by(made) or "none known",
+        "licence": licence or provenance["licence"],
+        "data": provenance["data"],
+        "data licence": provenance["data_licence"],
+        "recordings": seen_by(provenance) or "none known",
         "checkpoint": digest,
     }
     lines = [
         *front_matter(
-            [licence or str(made["licence"])],
+            [licence or str(provenance["licence"])],
             library_name="lidar_synth",
             pipeline_tag=TASKS.get(str(condition), "unconditional-image-generation"),
             tags=["lidar", "point-cloud", "range-image"],

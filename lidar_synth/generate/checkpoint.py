@@ -17,7 +17,7 @@ generation needs::
                     ``dropout``, share of blank conditions in training; ``image``, rows and columns
                     of the camera's images
     time_grid       times descending from 1 to 0: the steps that the weights were trained for
-    other_grids     those for other numbers of steps, if there are any
+    other_grids     time grids for other numbers of steps, if there are any
     provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher,
                     recipe, metrics
     weights         sha256 of all tensors
@@ -107,13 +107,13 @@ class Header:
         # The network that takes range images has the grid of the sensor.
         name = CODEC if CODEC in self.networks else VELOCITY
         arguments = self.networks[name].arguments
-        given = (
+        network = (
             arguments.get("channels", shape[0]),
             *arguments.get("resolution", shape[1:]),
         )
-        if given != shape:
+        if network != shape:
             raise ConfigError(
-                f"a network for {given} channels, rows and columns",
+                f"a network for {network} channels, rows and columns",
                 f"{shape}: channels {self.channels} on sensor {self.sensor.name!r}",
             )
 
@@ -123,8 +123,8 @@ class Header:
         return TensorFormat(self.channels, self.normalisation)
 
     def grid(self, steps: int | None) -> tuple[float, ...]:
-        """The time grid of a number of steps, None = ``time_grid``; uniform where the weights know
-        none.
+        """The time grid for a number of steps: the header's if it has one, else a uniform one; None
+        = ``time_grid``.
 
         Raises:
             ConfigError: on fewer than one step.
@@ -332,8 +332,8 @@ def read_header(path: Path) -> tuple[Header, str]:
 
 
 class _Content(NamedTuple):
-    """The content of a checkpoint file; ``weights`` is the checksum of the tensors by the
-    header."""
+    """The content of a checkpoint file; ``weights`` is the checksum of the tensors that the header
+    states."""
 
     header: Header
     hash: str

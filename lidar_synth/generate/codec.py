@@ -45,9 +45,11 @@ class Codec(Protocol):
         uniform_noise: Tensor | None = None,
         given: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
-        """States (B, *shape) to tensors (B, C, H, W), sampled with (B, draws, H, W) numbers in (0,
-        1); None = the mode. With {name of a condition: values (B, ...)}, autoencoders that can
-        follow them exactly."""
+        """States (B, *shape) to tensors (B, C, H, W).
+
+        They are sampled with ``uniform_noise``, (B, draws, H, W) numbers in (0, 1); None = the
+        mode. Some autoencoders follow ``given``, {name of a condition: values (B, ...)}, exactly.
+        """
         ...
 
 
@@ -115,10 +117,10 @@ class Latent:
 
         Args:
             y: latents.
-            uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample with, whereupon returns
-                without support are left out (``support``); None = the mode.
-            given: {name of a condition: values (B, ...)}; those not among the autoencoder's
-                ``decodes_given`` are not used.
+            uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample with; returns without
+                support (support.py) are then removed. None = the mode.
+            given: {name of a condition: values (B, ...)}; only those named in the autoencoder's
+                ``decodes_given`` are used.
 
         Raises:
             DataError: on latents of another shape.
@@ -129,14 +131,14 @@ class Latent:
                 f"(B, {', '.join(map(str, self.shape))})",
             )
         decode: Callable[..., Tensor] = self.network.decode
-        taken = {
+        used = {
             name: values
             for name, values in (given or {}).items()
             if name in self.network.decodes_given
         }
-        image = expected(
-            decode(y, uniform_noise, *([taken] if taken else [])).float(), self.tensors
-        )
+        # Other autoencoders take no third argument.
+        decoded = decode(y, uniform_noise, *([used] if used else []))
+        image = expected(decoded.float(), self.tensors)
         if uniform_noise is not None:
             self._clear_unsupported(image[:, 0])  # the range
         return image
@@ -164,11 +166,11 @@ def make_codec(
     if network is None:
         return Identity((tensors.size, *resolution))
     codec = cast(Autoencoder, network)
-    given = (codec.channels, *codec.resolution)
+    shape = (codec.channels, *codec.resolution)
     wanted = (tensors.size, *resolution)
-    if given != wanted:
+    if shape != wanted:
         raise DataError(
-            f"an autoencoder for images of shape {given}",
+            f"an autoencoder for images of shape {shape}",
             f"{wanted} for {tensors.channels}",
         )
     return Latent(codec, tensors)

@@ -43,7 +43,7 @@ HEIGHT_TOLERANCE = 0.35
 the other."""
 
 GAP = 2
-"""Cells of a gap in the labels of a scan that is closed."""
+"""Widest gap in the labels of a scan, in cells of a row, that is closed."""
 
 
 class Condition(ABC):
@@ -79,8 +79,13 @@ class Condition(ABC):
         """Raise a DataError on invalid values."""
 
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
-        """Conditions (B, ...) that tell less, for training: u (B,) uniform numbers, ``views`` of a
-        camera image."""
+        """Conditions (B, ...) with less information, for training.
+
+        Args:
+            values: (B, ...) conditions.
+            u: (B,) uniform random numbers in [0, 1), which choose how much remains.
+            views: number of views side by side in a camera image.
+        """
         return values
 
 
@@ -210,7 +215,7 @@ def resize_image(
             are resized one by one, as in LiDM: by bicubic interpolation between the centres of
             their corner pixels, without antialiasing. Without it, the image is resized as a whole,
             with antialiasing.
-        what: the image, in an error's words.
+        what: name of the image in errors.
 
     Returns:
         (3, h, w) uint8 red, green, blue.
@@ -236,13 +241,13 @@ def resize_image(
 def _resize_views(
     pixels: NDArray[np.uint8], shape: tuple[int, ...], views: int
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) pixels to ``shape``, each of the views side by side by itself; columns that W has
-    beyond a multiple of ``views`` are left out."""
+    """(H, W, 3) pixels to ``shape``; the views side by side are resized separately. Columns beyond
+    a multiple of ``views`` are left out."""
     width = pixels.shape[1] // views
     cut = [pixels[:, i * width : (i + 1) * width] for i in range(views)]
-    given = torch.from_numpy(np.stack(cut)).movedim(-1, 1).float()
+    stacked = torch.from_numpy(np.stack(cut)).movedim(-1, 1).float()
     resized = F.interpolate(
-        given, (shape[1], shape[2] // views), mode="bicubic", align_corners=True
+        stacked, (shape[1], shape[2] // views), mode="bicubic", align_corners=True
     )
     side_by_side = torch.cat(list(resized.round().clamp(0, 255)), -1)
     return side_by_side.to(torch.uint8).numpy()
@@ -303,8 +308,8 @@ class LayoutImage(Condition):
             )
 
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
-        """Without outlines, and with the ground up to a distance that u tells, as most users' files
-        are."""
+        """Layout images as most users' files give them: without outlines, and with the ground only
+        up to a distance that ``u`` chooses."""
         code = values[:, :1]
         ground = CODES["ground"]
         depth = depths_of(values)[:, None]
@@ -397,7 +402,7 @@ def batch_of(
         given = given[name]
     readable = (Scan, Layout) if name == "layout" else Scan
     if isinstance(given, readable):
-        # A layout for layouts only.
+        # Only LayoutImage gets a Layout.
         given = condition.read(given, sensor, shape, options)  # type: ignore[arg-type]
     elif isinstance(given, Sequence) and given and not isinstance(given, str):
         given = torch.cat(

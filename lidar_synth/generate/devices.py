@@ -13,11 +13,8 @@ def available_devices() -> list[str]:
     names = ["cpu"]
     for kind in ("cuda", "xpu"):
         module = getattr(torch, kind)
-        names += (
-            [f"{kind}:{i}" for i in range(module.device_count())]
-            if module.is_available()
-            else []
-        )
+        if module.is_available():
+            names += [f"{kind}:{i}" for i in range(module.device_count())]
     return [*names, "mps"] if torch.backends.mps.is_available() else names
 
 
@@ -29,19 +26,19 @@ def check_device(device: str | torch.device) -> torch.device:
             ones.
     """
     try:
-        given = torch.device(device)
+        wanted = torch.device(device)
     except (RuntimeError, TypeError) as error:  # an unknown name, or not a string
         raise _missing(device, available_devices()) from error
-    if given.type == "cpu" and not given.index:
+    if wanted.type == "cpu" and not wanted.index:
         # Without querying GPUs: after CUDA is initialised, forked children cannot use it.
-        return given
+        return wanted
     available = available_devices()
     kinds = {name.partition(":")[0] for name in available}
-    if str(given) not in available and (
-        given.type not in kinds or given.index is not None
+    if str(wanted) not in available and (
+        wanted.type not in kinds or wanted.index is not None
     ):
         raise _missing(device, available)
-    return given
+    return wanted
 
 
 def _missing(device: object, available: list[str]) -> ConfigError:
@@ -68,8 +65,8 @@ def refuse_worker(device: torch.device | str) -> None:
 
 
 def without_autocast(device: torch.device) -> AbstractContextManager[None]:
-    """A context in which the caller's ``torch.autocast``, with which a generator would give other
-    scans, has no effect."""
-    # torch 2.4 knows none for "mps".
+    """A context without the caller's ``torch.autocast``, which would change the scans of a
+    generator."""
+    # torch 2.4 has no autocast for "mps".
     kind = device.type if torch.amp.is_autocast_available(device.type) else "cpu"
     return torch.autocast(kind, enabled=False)

@@ -77,8 +77,8 @@ class Generator:
         hash: the checkpoint's hash; "" for weights without a checkpoint.
         batch: number of scans computed at a time; it affects only memory and speed.
         autoencoder: the autoencoder of a latent model; None for a pixel model.
-        columns: of the scans, where the autoencoder decodes to several widths; None = the
-            checkpoint's.
+        columns: number of columns of the scans, if the autoencoder decodes to several widths; None
+            = the checkpoint's.
         path: the checkpoint's file; None for weights without one.
 
     Example:
@@ -103,8 +103,7 @@ class Generator:
     def __post_init__(self) -> None:
         if not isinstance(self.batch, int | np.integer) or self.batch < 1:
             raise ConfigError(f"batch={self.batch}", "a number of scans, at least 1")
-        own = self.header.sensor.columns
-        widths = getattr(self.autoencoder, "widths", (own,))
+        widths = getattr(self.autoencoder, "widths", (self.header.sensor.columns,))
         if self.columns is not None and self.columns not in widths:
             raise ConfigError(
                 f"{self.columns} columns of {self.name!r}",
@@ -119,10 +118,10 @@ class Generator:
     @property
     def sensor(self) -> Sensor:
         """The sensor that defines the grid of the range images."""
-        held = self.header.sensor
-        if self.columns in (None, held.columns):
-            return held
-        return replace(held, columns=self.columns)
+        sensor = self.header.sensor
+        if self.columns in (None, sensor.columns):
+            return sensor
+        return replace(sensor, columns=self.columns)
 
     @property
     def tensors(self) -> TensorFormat:
@@ -136,8 +135,8 @@ class Generator:
 
     @property
     def variant(self) -> str:
-        """A text of what else than the checkpoint determines the scans: columns and precision; ""
-        for its own."""
+        """The settings other than the checkpoint that determine the scans, columns and precision,
+        as a text; "" for the checkpoint's own."""
         dtype = next(self.network.parameters()).dtype
         columns = (
             "" if self.sensor == self.header.sensor else f":{self.columns} columns"
@@ -189,12 +188,12 @@ class Generator:
                 f"generator {self.name!r}, whose checkpoint is not (or no longer) in a file",
                 "one of load_generator",
             )
-        there = Repository("model", name)
+        repository = Repository("model", name)
         parts = [self.network, *filter(None, [self.autoencoder])]
         size = sum(p.numel() for part in parts for p in part.parameters())
-        card = model_card(str(there), self.header, self.hash, size, licence)
+        card = model_card(str(repository), self.header, self.hash, size, licence)
         files = {self.path.name: self.path}
-        return push(there, card.encode(), files, private)
+        return push(repository, card.encode(), files, private)
 
     def as_synthetic(self, seed: int = 0) -> "Generated":
         """The scans of a seed by number, made when they are read."""
@@ -227,13 +226,13 @@ class Generator:
 
         Returns:
             B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its
-                ``confidence`` in
-            [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0) where there is no
-            return. If a model conditioned on semantic maps does not generate labels, ``label`` is
-            the map's where there is a return, with confidence 1 where the map's label is known. The
-            autoencoder of "town-semantic" gives returns the map's labels too, with their
-            probabilities as confidence. A model conditioned on a ``Layout`` or on the layout of a
-            scan gives the image the boxes that hold a return, and their numbers in ``instance``.
+            ``confidence`` in [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0)
+            where there is no return. If a model conditioned on semantic maps does not generate
+            labels, ``label`` is the map's where there is a return, with confidence 1 where the
+            map's label is known. The autoencoder of "town-semantic" gives returns the map's labels
+            too, with their probabilities as confidence. A model conditioned on a ``Layout`` or on
+            the layout of a scan gives the image the boxes that hold a return, and their numbers in
+            ``instance``.
 
         Raises:
             ConfigError: on an invalid seed, index, number of steps or solver, a condition for an
@@ -248,24 +247,25 @@ class Generator:
             raise ConfigError(f"indices={indices}", f"a list of them, [{indices}]")
         if not len(indices):
             return []
-        given = self.condition_tensor(condition, len(indices))
-        laid = self.condition == "layout"
-        boxes = boxed.boxes_of(condition, len(indices)) if laid else None
-        cast = boxes is not None and isinstance(objects, boxed.Drawer)
-        if objects is not None and not cast:
+        conditions = self.condition_tensor(condition, len(indices))
+        boxes = None
+        if self.condition == "layout":
+            boxes = boxed.boxes_of(condition, len(indices))
+        castable = boxes is not None and isinstance(objects, boxed.Drawer)
+        if objects is not None and not castable:
             raise ConfigError(
                 f"{objects!r} as objects for {self.name!r}",
                 "ObjectBank.from_town_shapes(), for layouts of a model of layouts",
             )
         images = []
-        for tensor in self.samples(seed, indices, given, **options):
+        for tensor in self.samples(seed, indices, conditions, **options):
             images += self.tensors.to_images(tensor, self.sensor)
         if (
             self.condition == "semantic"
             and "label" in self.fields - set(self.header.channels)
-            and given is not None
+            and conditions is not None
         ):
-            for image, labels in zip(images, given.cpu().numpy(), strict=True):
+            for image, labels in zip(images, conditions.cpu().numpy(), strict=True):
                 image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(
                     np.uint8
                 )
@@ -293,13 +293,13 @@ class Generator:
         ``<checkpoint>/<seed>/<index>``, and its ``domain`` is ``SYNTHETIC``.
         """
         images = self.range_images(seed, indices, condition, objects, **options)
-        made = model_provenance(self.name, self.hash, seed)
+        provenance = model_provenance(self.name, self.hash, seed)
         return [
             replace(
                 unproject(image),
                 id=f"{self.name}/{seed}/{index}",
                 domain=SYNTHETIC,
-                provenance=made,
+                provenance=provenance,
             )
             for index, image in zip(indices, images, strict=True)
         ]
@@ -323,7 +323,7 @@ class Generator:
         refuse_worker(self.device)
         if not 0 <= guidance <= 100:
             raise ConfigError(f"guidance {guidance}", "0 to 100; 1 is no guidance")
-        given = self.condition_tensor(condition, len(indices))
+        conditions = self.condition_tensor(condition, len(indices))
         codec = self.codec
         grid = self.header.grid(steps) if times is None else read_grid(times)
         if times is not None and steps is not None:
@@ -337,21 +337,18 @@ class Generator:
             part = slice(first, first + self.batch)
             noise, draws = self.draw_noise(seed, indices[part], self.sensor)
             with torch.inference_mode(), without_autocast(self.device):
-                own = None if given is None else given[part]
-                velocity, cond = self._flow(own, guidance, grid)
-                state = solve(velocity, noise, grid, solver, cond)
-                made = codec.decode(
-                    state,
-                    draws,
-                    None if own is None else {str(self.condition): own},
-                )
-            yield made
+                values = None if conditions is None else conditions[part]
+                velocity, encoded = self._flow(values, guidance, grid)
+                state = solve(velocity, noise, grid, solver, encoded)
+                given = None if values is None else {str(self.condition): values}
+                tensors = codec.decode(state, draws, given)
+            yield tensors
 
     def draw_noise(
         self, seed: int, indices: Sequence[int], sensor: Sensor
     ) -> tuple[Tensor, Tensor | None]:
-        """The noise (B, ...) that flows start from, and that of a decoder that draws, for a
-        sensor's grid."""
+        """The noise (B, *codec.shape) that flows start from, and the uniform noise (B, draws, H, W)
+        of a decoder that samples, else None, on a sensor's grid."""
         codec = self.codec
         noise = gaussian(seed, indices, codec.shape, self.device)
         if not codec.draws:
@@ -362,8 +359,8 @@ class Generator:
     def _flow(
         self, condition: Tensor | None, guidance: float, grid: Sequence[float]
     ) -> tuple[Velocity, Tensor | None]:
-        """The velocity to solve on a grid, and its encoded condition: it is encoded once, not at
-        every step."""
+        """The velocity to solve on a grid, and its condition, encoded once rather than at every
+        step."""
         options = self.header.conditioning.get(str(self.condition), {})
         if guidance != 1 and (condition is None or not options.get("dropout")):
             raise ConfigError(
@@ -379,9 +376,8 @@ class Generator:
             if guidance != 1
             else condition
         )
-        return guide(
-            mean_velocity(self.network.velocity, grid), guidance, unconditional
-        ), encode(condition)
+        velocity = mean_velocity(self.network.velocity, grid)
+        return guide(velocity, guidance, unconditional), encode(condition)
 
     def condition_tensor(self, given: Any, count: int) -> Tensor | None:
         """The conditions (B, ...) as the network takes them, on its device; None for an
@@ -409,8 +405,8 @@ class Generator:
             )
         options = self.header.conditioning[self.condition]
         encoder = self.network.encoder
-        kept = getattr(encoder, "seen", None)
-        if isinstance(given, Tensor) and given.shape[1:] == kept:
+        features = getattr(encoder, "seen", None)  # shape of an image's features
+        if isinstance(given, Tensor) and given.shape[1:] == features:
             return given.to(self.device)  # a training keeps these instead of images
         shape = CONDITIONS[self.condition].shape(encoder)
         return batch_of(
@@ -464,10 +460,10 @@ class Generated:
             raise ConfigError(f"cache={cache}", "a number of scans")
         for name in sampling:
             choose("sampling option", name, _OPTIONS)
-        given = condition is not None and len(condition) > 0
-        if given == (generator.condition is None):
+        conditioned = condition is not None and len(condition) > 0
+        if conditioned != (generator.condition is not None):
             raise ConfigError(
-                f"{'conditions' if given else 'no conditions'} for {generator.name!r}",
+                f"{'conditions' if conditioned else 'no conditions'} for {generator.name!r}",
                 f"a source of conditions ({generator.condition})"
                 if generator.condition
                 else "none",

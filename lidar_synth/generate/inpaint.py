@@ -1,9 +1,8 @@
-"""Part of a range image drawn again by a generator: known cells are kept, the cells of a hole are
-sampled.
+"""Inpainting of range images by a generator: known cells are kept, the cells of a hole are sampled.
 
 In every step the state outside the hole is the known one at that time, y_t = (1 - t) y0 + t y1 with
-y0 the encoded image; only the state inside the hole follows the flow (Lugmayr et al., "RePaint",
-CVPR 2022, for a rectified flow).
+y0 the encoded image and y1 the noise; only the state inside the hole follows the flow (Lugmayr et
+al., "RePaint", CVPR 2022, for a rectified flow).
 """
 
 from collections.abc import Sequence
@@ -24,8 +23,8 @@ from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry import RangeImage, Sensor
 
 START = 0.6
-"""Latest time of the noise from which a hole is sampled: the provisional content keeps its large
-shapes."""
+"""Default time from which the flow starts in a hole; the large shapes of the provisional content
+remain."""
 
 
 def inpaint(
@@ -74,14 +73,14 @@ def inpaint(
     drawn = []
     for first in range(0, len(images), generator.batch):
         part = slice(first, first + generator.batch)
-        drawn += _batch(
+        drawn += _inpaint_batch(
             generator, images[part], holes[part], seed, indices[part], start
         )
     return drawn
 
 
-def check_model(generator: Generator, given: Sensor) -> None:
-    """Check that a model fills holes in scans of a sensor; names and range limits of sensors may
+def check_model(generator: Generator, sensor: Sensor) -> None:
+    """Check that a model can fill holes in scans of a sensor; names and range limits of sensors may
     differ.
 
     Raises:
@@ -95,17 +94,17 @@ def check_model(generator: Generator, given: Sensor) -> None:
             "Use model='town', or no model.",
         )
     wanted = generator.header.sensor
-    if given.shape != wanted.shape or not np.array_equal(given.edges, wanted.edges):
+    if sensor.shape != wanted.shape or not np.array_equal(sensor.edges, wanted.edges):
         raise DataError(
-            f"a scan of sensor {given.name!r} ({given.shape[0]} x {given.shape[1]}) for a model of "
-            f"{wanted.name!r} ({wanted.shape[0]} x {wanted.shape[1]})",
+            f"a scan of sensor {sensor.name!r} ({sensor.shape[0]} x {sensor.shape[1]}) for a model "
+            f"of {wanted.name!r} ({wanted.shape[0]} x {wanted.shape[1]})",
             "scans on the model's grid",
-            f"Read them so if they fit: --sensor {wanted.name} (sensor=...). Else model=None, or "
-            "a model that was trained for this sensor.",
+            f"If the scans fit it, read them with --sensor {wanted.name} (sensor=...). Otherwise "
+            "use model=None, or a model that was trained for this sensor.",
         )
 
 
-def _batch(
+def _inpaint_batch(
     generator: Generator,
     images: Sequence[RangeImage],
     holes: Sequence[NDArray[np.bool_]],
@@ -113,6 +112,7 @@ def _batch(
     indices: Sequence[int],
     start: float,
 ) -> list[RangeImage]:
+    """``inpaint`` for the images of one batch."""
     codec = generator.codec
     device = generator.device
     images = [_complete(image) for image in images]
@@ -139,7 +139,14 @@ def _batch(
 def _sample(
     generator: Generator, known: Tensor, noise: Tensor, inside: Tensor, start: float
 ) -> Tensor:
-    """The states (B, *shape) at time 0, which are the known ones outside the hole."""
+    """The states (B, *shape) at time 0, which outside the hole are the known ones.
+
+    Args:
+        generator: the model.
+        known, noise: (B, *shape) encoded images, and noise.
+        inside: (B, 1, h, w) bool, True for the cells of a state to sample.
+        start: as for ``inpaint``.
+    """
     grid = [t for t in generator.header.time_grid if t <= start]
     if len(grid) < 2:
         raise ConfigError(
@@ -155,12 +162,12 @@ def _sample(
 
 
 def _complete(image: RangeImage) -> RangeImage:
-    """The image with every channel that a model may give."""
+    """The image with every channel that a model may need, missing ones with default values."""
     unknown = np.full(image.range.shape, IGNORE, np.uint8)
     label = image.channels.get("label", unknown)
-    every: dict[str, NDArray[Any]] = {
+    defaults: dict[str, NDArray[Any]] = {
         "reflectance": np.zeros(image.range.shape, np.float32),
         "label": label,
         "confidence": (label != IGNORE).astype(np.float32),
     }
-    return RangeImage(image.range, image.sensor, every | image.channels)
+    return RangeImage(image.range, image.sensor, defaults | image.channels)

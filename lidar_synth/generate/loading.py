@@ -38,7 +38,8 @@ def load_generator(
         compile: whether to compile the velocity network and the decoder of a latent model with
             ``torch.compile``; the first scan then takes long.
         batch: number of scans computed at a time; by default it depends on the device.
-        columns: of the scans; a model of 2,048 generates 1,024 at about half of the decoder's cost.
+        columns: number of columns of the scans; a model of 2,048 columns can also generate 1,024,
+            at about half of the decoder's cost.
 
     Raises:
         ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, a
@@ -119,8 +120,8 @@ def find_model(model: str | Path) -> Path:
 
 
 def settle_model(model: str) -> str:
-    """A name for the same model from any folder and at any time: that of a shipped one, an absolute
-    path, or a commit of the hub.
+    """The name by which a model is found from any folder and at any time: that of a shipped one, an
+    absolute path, or a commit of the hub.
 
     Raises:
         FileError, LibraryError: as ``hub.pin_model``.

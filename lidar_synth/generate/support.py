@@ -1,10 +1,10 @@
 """Returns need support: on a real surface, neighbouring rays return from almost the
 same distance.
 
-A decoder draws which surface each cell of a patch shows by itself, so that at an edge
-single cells end up between or behind surfaces, which a bird's-eye view shows as fans
-along the rays. A scanner has hardly any such returns: in the town 0.3 % of those
-between 8 and 35 m have fewer than three neighbours within 0.15 m + 2 % of their range.
+A decoder draws for each cell of a patch independently which surface it shows. At an edge,
+single cells therefore end up between or behind surfaces, which a bird's-eye view shows as
+fans along the rays. Sensors hardly give such returns: in the town, 0.3 % of those between
+8 and 35 m have fewer than three neighbours within 0.15 m + 2 % of their range.
 """
 
 import numpy as np
@@ -12,17 +12,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 NEIGHBOURS = 3
-"""Neighbours that a return needs, or fewer where the window has fewer columns to
-either side: a coarse grid has few returns of one object."""
+"""Number of neighbours that a return needs; at most the window's columns to either side,
+because a coarse grid has few returns of one object."""
 TOLERANCE = 0.1, 0.0175
-"""Largest difference of their ranges: metres, and metres per metre of range. With the
-distance across the rays of the window it stays within 0.15 m + 2 %."""
+"""Largest difference between the ranges of neighbours: metres, and metres per metre of
+range. With the distance across the rays of the window it is within 0.15 m + 2 %."""
 ROWS = 2
 """Rows of the window above and below a cell."""
 TURN = 512
-"""The window's columns to either side: one in so many of a full turn."""
+"""The window has 1 / TURN of a full turn's columns to either side of a cell."""
 PASSES = 3
-"""A removed return may have been the support of another one."""
+"""Number of passes, because a removed return may have supported another one."""
 
 
 def find_unsupported(distance: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -35,14 +35,14 @@ def find_unsupported(distance: NDArray[np.float32]) -> NDArray[np.bool_]:
         (B, H, W).
     """
     columns = max(distance.shape[2] // TURN, 1)
-    left = distance.copy()
-    for image in left:
+    kept = distance.copy()
+    for image in kept:
         for _ in range(PASSES):
             around = np.pad(image, ((ROWS, ROWS), (0, 0)))
             around = np.pad(around, ((0, 0), (columns, columns)), "wrap")
             image[_find_unsupported(around, columns)] = 0
-    lost: NDArray[np.bool_] = (distance > 0) & (left == 0)
-    return lost
+    unsupported: NDArray[np.bool_] = (distance > 0) & (kept == 0)
+    return unsupported
 
 
 @njit(cache=True, nogil=True)
@@ -52,18 +52,18 @@ def _find_unsupported(around, columns):  # type: ignore[no-untyped-def]
     height = around.shape[0] - 2 * ROWS
     width = around.shape[1] - 2 * columns
     wanted = min(NEIGHBOURS, columns)
-    found = np.zeros((height, width), np.bool_)
+    unsupported = np.zeros((height, width), np.bool_)
     for i in range(height):
         for j in range(width):
             own = around[i + ROWS, j + columns]
             if own > 0:
                 limit = np.float32(TOLERANCE[0]) + np.float32(TOLERANCE[1]) * own
-                count = -1  # without the cell itself
-                for n in range(2 * ROWS + 1):  # the own row first, then outwards
+                count = -1  # the loop counts the cell itself, too
+                for n in range(2 * ROWS + 1):  # the cell's row first, then outwards
                     row = around[i + ROWS + (n + 1) // 2 * (2 * (n % 2) - 1)]
                     for other in row[j : j + 2 * columns + 1]:
                         count += abs(other - own) < limit
                     if count >= wanted:
                         break
-                found[i, j] = count < wanted
-    return found
+                unsupported[i, j] = count < wanted
+    return unsupported

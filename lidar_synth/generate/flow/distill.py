@@ -152,8 +152,8 @@ def every_piece(
     steps: int,
     cond: Any = None,
 ) -> Example:
-    """A student of several numbers of steps, which is told where a step ends: every interval of all
-    grids.
+    """The supervision of one student for several numbers of steps, which is told where a step ends:
+    every interval of all grids.
 
     Intervals that begin at noise are parts of one trajectory of the teacher. The others begin
     between data and noise, as in Algorithm 1.
@@ -187,9 +187,8 @@ def every_piece(
 
     with torch.no_grad():
         from_noise = {1.0: y1}
-        for a, b in pairwise(
-            sorted({1.0, *(b for a, b in pieces if a == 1)}, reverse=True)
-        ):
+        times = sorted({1.0, *(b for a, b in pieces if a == 1)}, reverse=True)
+        for a, b in pairwise(times):
             from_noise[b] = follow(from_noise[a], a, b)
         start, end = (
             torch.cat([y1.new_full((len(y1),), t) for t in side])
@@ -218,7 +217,7 @@ STRATEGIES: dict[str, Strategy] = {
 """Strategies by name."""
 
 UNIFORM = ("uniform_piecewise", "timestep_distillation")
-"""Those that need a uniform grid."""
+"""The strategies that need a uniform grid."""
 
 
 def interval_of(t: Tensor, grid: Sequence[float]) -> Tensor:
@@ -242,7 +241,7 @@ def _times(grid: Sequence[float], like: Tensor) -> Tensor:
     times = check_grid(grid)
     if times[0] != 1 or times[-1] != 0:
         raise ConfigError(f"time grid {times.tolist()}", "one from 1 down to 0")
-    # Without waiting for a GPU, in every step of a training.
+    # non_blocking: a training does this in every step, and should not wait for the GPU.
     return times.to(like.device, like.dtype, non_blocking=True)
 
 
@@ -286,5 +285,5 @@ def check_uniform(grid: Sequence[float]) -> None:
         raise ConfigError(
             f"time grid {tuple(grid)}",
             f"{uniform}, which is uniform",
-            "Or take adaptive_piecewise, or no grid (in a recipe grid=null).",
+            "Use adaptive_piecewise, or give no grid (in a recipe grid=null).",
         )

@@ -99,8 +99,8 @@ def balanced_velocity_loss(
 
 
 def _errors(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
-    given = (example.cond,) if example.end is None else (example.cond, example.end)
-    return metric(velocity(example.y, example.t, *given), example.velocity)
+    rest = (example.cond,) if example.end is None else (example.cond, example.end)
+    return metric(velocity(example.y, example.t, *rest), example.velocity)
 
 
 def squared_l2(a: Tensor, b: Tensor) -> Tensor:

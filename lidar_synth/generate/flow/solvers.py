@@ -164,12 +164,8 @@ def mean_velocity(velocity: Velocity, grid: Sequence[float]) -> Velocity:
 
     def mean_velocity(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
         times = ascending.to(t.device, t.dtype)
-        return velocity(
-            y,
-            t,
-            cond,
-            times[(torch.searchsorted(times, t.contiguous()) - 1).clamp_min(0)],
-        )  # type: ignore[call-arg]
+        following = (torch.searchsorted(times, t.contiguous()) - 1).clamp_min(0)
+        return velocity(y, t, cond, times[following])  # type: ignore[call-arg]
 
     return mean_velocity
 

@@ -128,8 +128,9 @@ def sum_costs(
         device: device of the teacher.
         condition: gives the conditions of a range of trajectories; None = unconditional.
         progress: whether to show a progress bar.
-        done: what an earlier call yielded last, which this one continues.
-        each: a ``map`` that may compute the batches elsewhere; their order decides the rounding.
+        done: the last costs of an earlier call, which this one continues.
+        each: a ``map`` that may compute the batches in other processes, in order, as the order
+            affects rounding.
 
     Yields:
         The costs of all trajectories up to now, after each batch.
@@ -167,8 +168,8 @@ def sum_costs(
 
     with bar:
         for total, optima in each(compute, range(count, trajectories, batch)):
-            both = np.concatenate((done.optima, optima))
-            done = TrajectoryCosts(done.total + total, both)
+            joined = np.concatenate((done.optima, optima))
+            done = TrajectoryCosts(done.total + total, joined)
             bar.update(len(optima))
             yield done
 

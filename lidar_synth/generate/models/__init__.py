@@ -94,8 +94,8 @@ def build_network(architecture: str, arguments: dict[str, Any]) -> Network:
 
 @contextmanager
 def limit_modules(most: int) -> Iterator[None]:
-    """Inside, building more than ``most`` modules fails: the arguments of a file may ask for 10^9
-    layers.
+    """A context in which networks of more than ``most`` modules cannot be built: the arguments in a
+    file may ask for 10^9 layers.
 
     Raises:
         ConfigError: on more modules.
@@ -137,7 +137,7 @@ def assemble(
         DataError: on invalid arguments, missing or unexpected keys, or weights of other shapes.
     """
     try:
-        # On "meta" there is neither time nor memory for weights that will be replaced.
+        # On "meta", the weights that will be replaced take neither time nor memory.
         with torch.device("meta"), limit_modules(64 + 16 * len(state)):
             network = build_network(architecture, arguments)
     except ConfigError as error:

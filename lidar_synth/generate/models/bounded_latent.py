@@ -106,10 +106,10 @@ class BoundedAutoencoder(Autoencoder):
         return self.expand(z + noise)
 
     def loss(self, x: Tensor, noise: Tensor, objective: Objective) -> Tensor:
-        """The negative log-likelihood of images (B, C, H, W) from their latents with noise; some
-        images are encoded without their labels."""
+        """The negative log-likelihood of images (B, C, H, W) from their latents with noise, a
+        scalar; a share of the images (``Losses.unlabelled``) is encoded without labels."""
         shape = self.latent_shape
-        some = noise.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
+        latent_noise = noise.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
         shown = x
         if objective.losses.unlabelled:
             blank = encode_labels(torch.full_like(x[:, 0], IGNORE, dtype=torch.uint8))
@@ -118,7 +118,9 @@ class BoundedAutoencoder(Autoencoder):
                 torch.special.ndtr(noise[:, -1, -1, -1]) < objective.losses.unlabelled
             )
             shown = torch.where(chosen.view(-1, 1, 1, 1), hidden, x)
-        return self.nll(self(shown, objective.losses.noise * some), x, objective)
+        return self.nll(
+            self(shown, objective.losses.noise * latent_noise), x, objective
+        )
 
     def decoder_loss(self, z: Tensor, x: Tensor, objective: Objective) -> Tensor:
         """The negative log-likelihood of images (B, C, H, W) from given latents (B, *latent_shape),

@@ -158,17 +158,17 @@ class EfficientUNet(Network):
         check_condition(cond, len(y), (0, 0, 0), 0)
         time = torch.as_tensor(t, dtype=torch.float64, device=y.device)
         time = time.expand(len(y)).reshape(-1, 1, 1, 1)
-        known = time.clamp(EARLIEST, 1 - EARLIEST)
-        ratio = 2 * torch.log((1 - known) / known)
+        clamped = time.clamp(EARLIEST, 1 - EARLIEST)
+        ratio = 2 * torch.log((1 - clamped) / clamped)
         x = y.double() / ((1 - time) ** 2 + time**2).sqrt()
-        found = self.predict(x.to(y.dtype), ratio.flatten().to(y.dtype)).double()
+        estimate = self.predict(x.to(y.dtype), ratio.flatten().to(y.dtype)).double()
         signal = ratio.sigmoid().sqrt()
         noise = (-ratio).sigmoid().sqrt()
         if self.predicts == "eps":
-            found = (x - noise * found) / signal
+            estimate = (x - noise * estimate) / signal
         elif self.predicts == "v":
-            found = signal * x - noise * found
-        return ((y - found.clamp(-1, 1)) / time.clamp(min=EARLIEST)).to(y.dtype)
+            estimate = signal * x - noise * estimate
+        return ((y - estimate.clamp(-1, 1)) / time.clamp(min=EARLIEST)).to(y.dtype)
 
     def predict(self, x: Tensor, ratio: Tensor) -> Tensor:
         """What the weights were trained to predict from states x (B, C, H, W) of variance 1 and the

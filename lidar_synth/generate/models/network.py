@@ -60,7 +60,7 @@ class Autoencoder(Network):
         """The training loss of images, a scalar; ``noise`` is standard normal, of their shape."""
 
     def measure(self, images: Iterable[Tensor], objective: Objective) -> None:
-        """Set what is not trained but measured, on some images (1, C, H, W)."""
+        """Set the values that are measured on images (1, C, H, W) instead of trained."""
 
 
 class Encoder(Network):

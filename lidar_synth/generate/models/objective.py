@@ -1,4 +1,4 @@
-"""What a training run wants of an autoencoder: the weights of its loss, and the terms that several
+"""The training objective of an autoencoder: the weights of its loss, and the terms that several
 architectures share."""
 
 from collections.abc import Callable, Mapping
@@ -31,9 +31,9 @@ class Losses:
         noise: standard deviation of the noise added to the latents of "surfaces", which lie in
             (-1, 1).
         rare: exponent of the class weights of "surfaces": the weight of a cell is the share of its
-            class in the batch to the power of -rare. Poles cover one per cent of a scan, but
-            matter more than that.
-        unlabelled: share of the images whose labels "surfaces" decodes without having seen them.
+            class in the batch to the power of -rare, so that rare classes such as poles count more.
+        unlabelled: share of the images that "surfaces" encodes without labels and decodes with
+            them.
 
     Raises:
         ConfigError: on a negative weight.
@@ -60,15 +60,15 @@ class Losses:
 
 @dataclass(frozen=True)
 class Objective:
-    """What an autoencoder is trained for.
+    """The training objective of an autoencoder.
 
     Args:
         tensors: layout of its images.
         rays: (3, H, W) directions of the cells, in units of 1 / maximum range.
         losses: weights of the terms.
-        metric: of the reconstruction.
-        weights: {channel: weight}, 1 by default.
-        discriminator: judges images, with an adversarial term.
+        metric: error of the reconstruction, of two tensors of one shape.
+        weights: {channel: weight in the reconstruction}, 1 by default.
+        discriminator: the network that judges images, if there is an adversarial term.
     """
 
     tensors: TensorFormat
