@@ -1,13 +1,13 @@
-"""Do points come from the sensor that they are said to come from?
+"""A check whether points come from the sensor that is assumed for them.
 
-A file of points names no sensor, and a wrong one loses points in silence: they fall into rows that
-are not theirs, or outside of the field of view. ``agreement`` counts the points and the beams that
+A file of points names no sensor, and with a wrong one points are lost silently: they fall into
+other rows, or outside of the field of view. ``agreement`` counts the points and the beams that
 contradict a sensor.
 
 Recorded scans contradict their own sensor a little: they tilt by up to one degree against the table
-of beams, motion compensation moves near points by 0.3 m, and the lasers of some sensors start up to
-0.2 m above the origin. Therefore angles are compared only beyond ``NEAR`` metres, for each sector
-of azimuth at the tilt that fits best.
+of beams, motion compensation moves near points by 0.3 m, and some lasers start up to 0.2 m above
+the origin. Therefore angles are compared only beyond ``NEAR`` metres, for each sector of azimuth at
+the tilt that fits best.
 """
 
 from typing import NamedTuple
@@ -31,19 +31,17 @@ MOST_GAPS = 0.15
 MOST_UNUSED = 0.55
 MOST_BETWEEN = 0.43
 """The largest shares that are accepted. Recorded scans reach 0.02, 0.04, 0.42 and 0.37 with their
-own sensor; points that are anywhere between the beams reach 0.44 to 0.60 in the last one, since the
-tilt is fitted."""
+own sensor; points at random elevations reach 0.44 to 0.60 in the last one, since the tilt is
+fitted."""
 
 _COMPARED = 20_000  # points; more change the shares by less than 0.01
-_FEWEST = 1000  # points without which nothing can be said
-_PER_LASER = (
-    15  # points of an average laser, without which nothing can be said about lasers
-)
+_FEWEST = 1000  # points that are needed for a comparison
+_PER_LASER = 15  # points of an average laser that are needed for shares of beams
 _SECTORS = 36
 _PER_SECTOR = 60
 _BIN = 0.02  # degrees
 _SHIFTS = np.arange(-30, 31, 2)  # bins: tilts of up to 0.6 degrees in one sector
-_COARSE = 0.3  # degrees by which the rows of a linear grid may miss the beams that they stand for
+_COARSE = 0.3  # degrees by which the rows of a linear grid may differ from the beams
 
 
 class Agreement(NamedTuple):
@@ -75,7 +73,7 @@ class Agreement(NamedTuple):
     def faults(self, sensor: Sensor) -> list[str]:
         """What contradicts the sensor, one text for each share that is too large; [] if nothing
         does."""
-        found = []
+        texts = []
         if self.outside > MOST_OUTSIDE:
             places = {
                 f"above {sensor.up:.1f} degrees": self.above,
@@ -83,7 +81,7 @@ class Agreement(NamedTuple):
                 f"nearer than {sensor.range_min:g} m": self.near,
                 f"farther than {sensor.range_max:g} m": self.far,
             }
-            found.append(
+            texts.append(
                 ", ".join(
                     f"{_percent(v)} of the points lie {k}"
                     for k, v in places.items()
@@ -92,17 +90,17 @@ class Agreement(NamedTuple):
             )
         rows = sensor.shape[0]
         if self.gaps > MOST_GAPS:
-            found.append(
+            texts.append(
                 f"{_percent(self.gaps)} of the {rows} beams have no points though beams around "
                 "them have"
             )
         elif self.unused > MOST_UNUSED:
-            found.append(f"{_percent(self.unused)} of the {rows} beams have no points")
+            texts.append(f"{_percent(self.unused)} of the {rows} beams have no points")
         if self.between > MOST_BETWEEN:
-            found.append(
+            texts.append(
                 f"{_percent(self.between)} of the points lie between the beams"
             )
-        return found
+        return texts
 
 
 def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
@@ -111,11 +109,10 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
     Args:
         points: (N, 3) metres, sensor frame. Points at the origin are firings without a return, and
             are not counted.
-        sensor: the sensor that they are said to come from.
+        sensor: the sensor that is assumed for them.
 
     Returns:
-        The shares that contradict the sensor; shares about which too few points tell anything are
-        0.
+        The shares that contradict the sensor; 0 where there are too few points to tell.
 
     Example:
         >>> from lidar_synth import Town, load_sensor
@@ -126,17 +123,17 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
         >>> agreement(points, load_sensor("hdl64e_kitti")).above > 0.2
         True
     """
-    some = points[:: max(1, len(points) // (2 * _COMPARED))].astype(np.float64)
-    some = some[np.isfinite(some).all(axis=1)]
-    distance = np.sqrt(np.einsum("ij,ij->i", some, some))
-    some = some[distance > 0.05]
+    sample = points[:: max(1, len(points) // (2 * _COMPARED))].astype(np.float64)
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    distance = np.sqrt(np.einsum("ij,ij->i", sample, sample))
+    sample = sample[distance > 0.05]
     distance = distance[distance > 0.05]
-    if len(some) < _FEWEST:
+    if len(sample) < _FEWEST:
         return Agreement()
     near = float((distance < sensor.range_min - 0.5).mean())
     far = float((distance > 1.02 * sensor.range_max + 0.5).mean())
-    some = some[distance > NEAR]
-    if len(some) < _FEWEST:
+    sample = sample[distance > NEAR]
+    if len(sample) < _FEWEST:
         return Agreement(near=near, far=far)
     # Points may lie on the sensor's lasers, or on the rows of its grid if they come from a range
     # image.
@@ -147,7 +144,7 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
         tables.append((lasers, np.asarray(sensor.heights or np.zeros(len(rows)))))
     exact = sensor.beams is not None or sensor.elevations is not None
     shares = [
-        _compare(some, table[::-1], heights[::-1], exact) for table, heights in tables
+        _compare(sample, table[::-1], heights[::-1], exact) for table, heights in tables
     ]
     above, below, gaps, unused, between = np.min(shares, axis=0).tolist()
     return Agreement(above, below, near, far, gaps, unused, between)
@@ -208,11 +205,11 @@ def _between(
     )
     image = counts.reshape(_SECTORS, -1).astype(np.float32)
     total = image.sum(axis=1)
-    told = total >= _PER_SECTOR
-    if not told.any():
+    enough = total >= _PER_SECTOR
+    if not enough.any():
         return 0.0
     hits = image @ np.stack([np.roll(on_beam, shift) for shift in _SHIFTS], axis=1)
-    return float(1 - hits[told].max(axis=1).sum() / total[told].sum())
+    return float(1 - hits[enough].max(axis=1).sum() / total[enough].sum())
 
 
 def _percent(share: float) -> str:

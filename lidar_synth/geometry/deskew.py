@@ -13,8 +13,8 @@ Floats = NDArray[np.float64]
 
 
 EXTENSION = 1.5
-"""Segments beyond the first and the last pose for which a trajectory holds: the turn before the
-first pose is one."""
+"""How far a trajectory is extrapolated before its first and after its last pose, in lengths of the
+nearest segment; the sweep that ends at the first pose needs one."""
 
 
 class Trajectory:
@@ -42,8 +42,8 @@ class Trajectory:
         self.times = np.asarray(times, np.float64)
         self.poses = np.asarray(poses, np.float64)
         self._check()
-        turn = self.poses[:, :3, :3]
-        steps = Rotation.from_matrix(turn[:-1].swapaxes(1, 2) @ turn[1:])
+        rotations = self.poses[:, :3, :3]
+        steps = Rotation.from_matrix(rotations[:-1].swapaxes(1, 2) @ rotations[1:])
         self._steps = steps.as_rotvec()
 
     def _check(self) -> None:
@@ -56,11 +56,12 @@ class Trajectory:
                 "times of poses that do not increase",
                 "finite seconds, one after the other",
             )
-        turn = self.poses[:, :3, :3]
+        rotations = self.poses[:, :3, :3]
+        squares = rotations @ rotations.swapaxes(1, 2)
         if not (
             np.isfinite(self.poses).all()
-            and np.allclose(turn @ turn.swapaxes(1, 2), np.eye(3), atol=1e-4)
-            and (np.linalg.det(turn) > 0).all()
+            and np.allclose(squares, np.eye(3), atol=1e-4)
+            and (np.linalg.det(rotations) > 0).all()
         ):
             raise DataError(
                 "poses whose upper left 3 x 3 part is not a rotation",
@@ -96,8 +97,8 @@ class Trajectory:
         return np.asarray(start + fraction[:, None] * (end - start))
 
     def _segments(self, times: Floats) -> tuple[NDArray[np.intp], Floats]:
-        """The segment of each time and the fraction of it; the first and the last one extend by 1.5
-        lengths."""
+        """The segment of each time (N,), and the fraction of the segment that has passed;
+        ``EXTENSION`` before the first and after the last one is accepted."""
         segment = np.clip(
             np.searchsorted(self.times, times, "right") - 1, 0, len(self.times) - 2
         )
@@ -177,7 +178,7 @@ def _times(scan: Scan, moment: float) -> Floats:
 
 def rotate(points: Floats, vectors: Floats) -> Floats:
     """(N, 3) points turned by rotation vectors (N, 3) or (3,), radians (Rodrigues' formula)."""
-    # not by scipy, whose earlier versions take no empty scan
+    # Not by scipy, whose older versions refuse empty arrays.
     angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
     axis = vectors / np.maximum(angle, 1e-12)
     along = np.sum(axis * points, -1, keepdims=True)

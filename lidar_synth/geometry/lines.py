@@ -11,6 +11,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 CHUNK = 1 << 15
+"""Number of points that are compared with all beams at a time."""
 
 
 def residuals(

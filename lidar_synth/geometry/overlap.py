@@ -29,12 +29,13 @@ def find_overlapping(
     if far.all():
         return ~far
     corners = footprints(np.concatenate([box[None], others]))
-    own = corners[0]
-    other = corners[1:]
-    axes = np.stack([corners[:, 0] - corners[:, 1], corners[:, 1] - corners[:, 2]], 1)
-    ours = np.concatenate([np.broadcast_to(axes[0], (len(others), 2, 2)), axes[1:]], 1)
-    a = ours @ own.T
-    b = ours @ other.transpose(0, 2, 1)
+    sides = np.stack([corners[:, 0] - corners[:, 1], corners[:, 1] - corners[:, 2]], 1)
+    # (M, 4, 2): the sides of the box, then those of the other one
+    axes = np.concatenate(
+        [np.broadcast_to(sides[0], (len(others), 2, 2)), sides[1:]], 1
+    )
+    a = axes @ corners[0].T
+    b = axes @ corners[1:].transpose(0, 2, 1)
     apart = (a.max(2) < b.min(2)) | (b.max(2) < a.min(2))
     return np.asarray(~apart.any(1))
 
@@ -44,18 +45,18 @@ def overlapping_pairs(boxes: Boxes, margin: float = MARGIN) -> list[tuple[int, i
     and heights."""
     values = boxes.values.copy()
     values[:, 3:6] = np.maximum(values[:, 3:6] - margin, 1e-3)
-    found = []
+    pairs = []
     for i, box in enumerate(values):
         later = values[i + 1 :]
         level = np.abs(later[:, 2] - box[2]) < (later[:, 5] + box[5]) / 2
         meet = find_overlapping(box, later) & level
-        found += [(i, i + 1 + int(j)) for j in np.flatnonzero(meet)]
-    return found
+        pairs += [(i, i + 1 + int(j)) for j in np.flatnonzero(meet)]
+    return pairs
 
 
 def count_overlapping(boxes: Boxes) -> int:
-    """Number of boxes that overlap another of their class, as objects do not: a moving car that has
-    a box at each of its places does."""
+    """Number of boxes that overlap another one of their class. Objects do not overlap, but several
+    boxes along the way of one moving car do."""
     names = boxes.names
     same = [{i, j} for i, j in overlapping_pairs(boxes) if names[i] == names[j]]
     return len(set().union(*same))

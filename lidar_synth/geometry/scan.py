@@ -84,10 +84,10 @@ class Boxes:
     )
 
     def __post_init__(self) -> None:
-        given = np.asarray(self.values, np.float32)
-        if given.size and given.shape[-1:] != (7,):
-            raise DataError(f"boxes of the shape {given.shape}", "(M, 7)")
-        self.values = given.reshape(-1, 7)
+        values = np.asarray(self.values, np.float32)
+        if values.size and values.shape[-1:] != (7,):
+            raise DataError(f"boxes of the shape {values.shape}", "(M, 7)")
+        self.values = values.reshape(-1, 7)
         self.names = tuple(self.names)
         count = len(self.values)
         for name, shape, dtype, unknown in (
@@ -301,7 +301,7 @@ class Scan:
         }
 
     def noted(self, name: str, **drawn: Any) -> "Scan":
-        """The scan with one more of ``augmented``."""
+        """The scan with one more augmentation in ``augmented``: its name and the values drawn."""
         return replace(self, augmented=(*self.augmented, {name: drawn}))
 
 
@@ -405,11 +405,11 @@ class Source(Protocol):
 
 
 def check_source(source: Any, hint: str = "") -> None:
-    """Refuse what gives no scans by number; ``hint`` is added to the error.
+    """Refuse an object that is no ``Source``; ``hint`` is added to the error.
 
     Raises:
-        ConfigError: on a path, a dict, a single scan, an ``IterableDataset``, or what has no
-            length.
+        ConfigError: on a path, a dict, a single scan, an ``IterableDataset``, or an object without
+            a length or an index.
     """
     from torch.utils.data import IterableDataset  # torch loads slowly
 
@@ -447,11 +447,14 @@ def spread(indices: Sequence[int], count: int) -> list[int]:
 
 
 def identity_of(source: Any) -> str:
-    """A text that identifies a source: its ``identity``, or its class, its length and a hash of its
-    scans' names; of torch's ``Subset``, a hash of its dataset's identity and its indices, and of
-    ``ConcatDataset`` one of its datasets' identities."""
-    if own := getattr(source, "identity", ""):
-        return str(own)
+    """A text that identifies a source: its ``identity`` if it has one, otherwise its class, its
+    length and a hash of its scans' names.
+
+    For torch's ``Subset``, the hash is of its dataset's identity and its indices; for a
+    ``ConcatDataset``, of the identities of its datasets.
+    """
+    if identity := getattr(source, "identity", ""):
+        return str(identity)
     names = getattr(source, "ids", ())
     if isinstance(parts := getattr(source, "datasets", None), Iterable):
         names = map(identity_of, parts)
@@ -479,16 +482,16 @@ def require_finite(scan: Scan) -> None:
 
 
 def require_reflectance(scan: Scan) -> None:
-    """Check that the reflectance of a scan is no intensity on another scale; values just above 1
+    """Check that the reflectance of a scan is not an intensity on another scale; values up to 1.1
     pass.
 
     Raises:
         DataError: if some are NaN, or not in [0, 1].
     """
-    given = scan.reflectance
-    if not np.abs(given).max(initial=0) < 1.1:
+    values = scan.reflectance
+    if not np.abs(values).max(initial=0) < 1.1:
         raise DataError(
-            f"scan {scan.id!r} with a reflectance of {given.min():g} to {given.max():g}",
+            f"scan {scan.id!r} with a reflectance of {values.min():g} to {values.max():g}",
             "0 to 1",
             "Another scale is divided by its maximum: reflectance_max=255 where scans are read.",
         )

@@ -217,9 +217,9 @@ class Sensor:
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W) of the range image."""
-        return len(
-            self.elevations
-        ) if self.elevations is not None else self.rows or 0, self.columns
+        if self.elevations is not None:
+            return len(self.elevations), self.columns
+        return self.rows or 0, self.columns
 
     @property
     def up(self) -> float:
@@ -496,8 +496,8 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
     Raises:
         ConfigError: on an unknown name, or a file without exactly one sensor.
         FileError: on a path that cannot be read.
-        DataError: on a file that is not UTF-8, or longer than a sensor's, or JSON that is no
-            Ouster's.
+        DataError: on a file that is not UTF-8 or too long for a sensor, or JSON that is not the
+            metadata of an Ouster sensor.
 
     Example:
         >>> from lidar_synth import load_sensor

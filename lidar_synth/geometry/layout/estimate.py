@@ -29,19 +29,18 @@ KINDS = {
 SECTORS = 512
 """Directions in which an outline has a corner."""
 
-_LEAST = 3  # returns of an outline in a sector
-# metres between the first wall of a sector and what stands behind it; and between connected sectors
-_GAP = 1.5
-# Metres by which the edges of connected sectors may differ, before they are two outlines.
-_STEP = 0.5
-_EDGE = 0.05  # metres between the outermost return and the edge of an outline
-# metres; the returns of a building in one sector differ less in their distance, without labels
-_FLAT = 0.3
-_CLEAR = 0.3  # metres above the ground of what stands on it, without labels
-_NEAR = 30.0  # metres around the sensor in which the ground is a plane
-_CUBE = (
-    1.0  # metres; side of the columns whose lowest return may be ground, without labels
+_LEAST = 3  # minimum number of returns of an outline in a sector
+# The others are in metres.
+_GAP = (
+    1.5  # between an outline and what stands behind it, and between connected sectors
 )
+_STEP = 0.5  # by which the edges of connected sectors may differ
+_EDGE = 0.05  # between the outermost return and the edge of an outline
+_NEAR = 30.0  # around the sensor, in which the ground is a plane
+# Without labels:
+_FLAT = 0.3  # largest depth of a building's returns in one sector
+_CLEAR = 0.3  # height above the ground from which on a return is of an outline
+_SQUARE = 1.0  # side of the squares whose lowest return may be ground
 
 
 def layout_of(scan: Scan, reach: float | None = None) -> Layout:
@@ -67,12 +66,12 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
             f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects"
         )
     label = scan.label if has_ground(scan.label) else None
-    ground = _plane(
-        _lowest(scan.points) if label is None else scan.points[GROUND[label]], scan.id
-    )
-    outlines = list(
-        _unlabelled(scan, ground) if label is None else _labelled(scan.points, label)
-    )
+    if label is None:
+        ground = _plane(_lowest(scan.points), scan.id)
+        outlines = list(_unlabelled(scan, ground))
+    else:
+        ground = _plane(scan.points[GROUND[label]], scan.id)
+        outlines = list(_labelled(scan.points, label))
     return Layout(
         select_known_boxes(scan),
         ground,
@@ -83,18 +82,20 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
 
 
 def select_known_boxes(scan: Scan) -> Boxes:
-    """The boxes of a scan with boxes that its layout has: of known classes, within the sensor's
-    range, of overlapping ones the first, and none around the sensor."""
+    """The boxes of a scan that its layout can have: of known classes, within the sensor's range,
+    and not around the sensor; of overlapping boxes only the first."""
     assert scan.boxes is not None
     boxes = scan.boxes[np.hypot(*scan.boxes.values[:, :2].T) <= scan.sensor.range_max]
     known = np.isin(np.array(boxes.names, "U32"), CLASSES)
     boxes = boxes[known & ~around_sensor(boxes)]
-    later: set[int] = set()
-    # in order, so that the first of a pair is kept or dropped already
+    dropped: set[int] = set()
+    # Pairs are in order: whether the first box of a pair is dropped is known by then.
     for first, second in overlapping_pairs(boxes):
-        if first not in later:
-            later.add(second)
-    return boxes[[i for i in range(len(boxes)) if i not in later]] if later else boxes
+        if first not in dropped:
+            dropped.add(second)
+    if not dropped:
+        return boxes
+    return boxes[[i for i in range(len(boxes)) if i not in dropped]]
 
 
 def _plane(points: Floats, name: str) -> tuple[float, float, float]:
@@ -122,7 +123,7 @@ def _plane(points: Floats, name: str) -> tuple[float, float, float]:
 def _lowest(points: Floats) -> Floats:
     """The lowest return of each column of 1 m x 1 m, where it lies below the sensor."""
     below = points[points[:, 2] < -0.5]
-    cell = np.floor(below[:, :2] / _CUBE).astype(np.int64) @ (1 << 20, 1)
+    cell = np.floor(below[:, :2] / _SQUARE).astype(np.int64) @ (1 << 20, 1)
     order = np.lexsort((below[:, 2], cell))
     _, first = np.unique(cell[order], return_index=True)
     return below[order[first]]
@@ -130,9 +131,8 @@ def _lowest(points: Floats) -> Floats:
 
 def _labelled(points: Floats, label: NDArray[np.uint8]) -> Iterator[Outline]:
     for kind, classes in KINDS.items():
-        for profile in _profiles(
-            points[np.isin(label, [TRAIN_ID[name] for name in classes])]
-        ):
+        train_ids = [TRAIN_ID[name] for name in classes]
+        for profile in _profiles(points[np.isin(label, train_ids)]):
             yield Outline(kind, profile[:, :2], profile[:, 2], profile[:, 3])
 
 
@@ -143,9 +143,8 @@ def _unlabelled(scan: Scan, ground: tuple[float, float, float]) -> Iterator[Outl
         ground[0] + scan.points[:, :2] @ np.array(ground[1:], np.float32)
     )
     assert scan.boxes is not None
-    for profile in _profiles(
-        scan.points[(height > _CLEAR) & ~scan.boxes.contain(scan.points).any(0)]
-    ):
+    outside = ~scan.boxes.contain(scan.points).any(0)
+    for profile in _profiles(scan.points[(height > _CLEAR) & outside]):
         kind = "building" if np.median(profile[:, 4]) < _FLAT else "vegetation"
         yield Outline(kind, profile[:, :2], profile[:, 2], profile[:, 3])
 
@@ -218,7 +217,8 @@ def _connected(rows: NDArray[np.float64]) -> Iterator[Floats]:
 
 
 def _trace(line: NDArray[np.float64]) -> Floats:
-    # Half a sector on both sides, so that lines of neighbouring sectors meet.
+    """The line (K, 5) of ``_profiles`` of connected sectors (K - 2, 5)."""
+    # Half a sector is added on both sides, so that lines of neighbouring sectors meet.
     edges = np.r_[line[0, 0], line[:, 0] + 0.5, line[-1, 0] + 1]
     padded = np.r_[line[:1], line, line[-1:]]
     azimuth = (edges / SECTORS - 0.5) * 2 * np.pi

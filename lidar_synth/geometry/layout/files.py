@@ -98,7 +98,7 @@ def load_layout(path: str | Path) -> Layout:
     path = Path(path)
     values = read_yaml(path, "a layout")
     try:
-        given = _File.model_validate(values)
+        content = _File.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         place = first["loc"]
@@ -106,31 +106,32 @@ def load_layout(path: str | Path) -> Layout:
         fault = first["msg"].partition(" or instance of")[0]
         entry = str(place[0]) if len(place) > 1 else ""
         raise ConfigError(f"{path}: {where}: {fault}", _KEYS[entry]) from error
-    rows = [_box(one, given.ground, path) for one in given.objects]
+    ground = content.ground
+    rows = [_box(item, ground, path) for item in content.objects]
     boxes = Boxes(
         np.array(rows, np.float32).reshape(-1, 7),
-        tuple(NAMES.get(o.kind, o.kind) for o in given.objects),
+        tuple(NAMES.get(item.kind, item.kind) for item in content.objects),
     )
     walls = [
         Outline(
-            w.kind,
-            np.array(w.line, np.float32),
-            given.ground + w.low,
-            given.ground + w.height,
+            wall.kind,
+            np.array(wall.line, np.float32),
+            ground + wall.low,
+            ground + wall.height,
         )
-        for w in given.outlines
+        for wall in content.outlines
     ]
-    return Layout(boxes, (given.ground, 0.0, 0.0), walls, given.reach, path.stem)
+    return Layout(boxes, (ground, 0.0, 0.0), walls, content.reach, path.stem)
 
 
-def _box(given: _Object, ground: float, path: Path) -> tuple[float, ...]:
-    """(7,) the box of an object."""
-    usual = choose(f"{path}: an object of class", given.kind, SIZES)
-    length, width, height = given.size or usual
-    yaw = wrap_angle(np.radians(given.heading))
+def _box(item: _Object, ground: float, path: Path) -> tuple[float, ...]:
+    """The box (7,) of an object, see ``Boxes``."""
+    usual = choose(f"{path}: an object of class", item.kind, SIZES)
+    length, width, height = item.size or usual
+    yaw = wrap_angle(np.radians(item.heading))
     return (
-        *given.at,
-        ground + given.above + height / 2,
+        *item.at,
+        ground + item.above + height / 2,
         length,
         width,
         height,

@@ -126,7 +126,7 @@ def project_batch(
         0, (cloud * (height * width) + cell)[in_range], key[in_range], "amin"
     )
     point = torch.where(best < _NONE, best & 0xFFFFFFFF, -1).view(batch, height, width)
-    # -1 is the last row, of zeros.
+    # Empty cells (-1) take the last row, which is zeros.
     shown = torch.cat([points, points.new_zeros(1, points.shape[1])])[point]
     distances = torch.cat([distance, distance.new_zeros(1)])[point]
     return BatchImage(distances, shown[..., 3:].movedim(-1, 1), point)

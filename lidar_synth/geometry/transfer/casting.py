@@ -24,8 +24,8 @@ FRONT = 0.5, 0.03
 surface to hide it."""
 
 REACH = 0.3
-"""Metres by which the level patch of a return that is not of the ground reaches along a ray: roofs
-end, the road goes on."""
+"""Metres by which the level patch of a return reaches along a ray unless it is of the ground: roofs
+end, but the road goes on."""
 
 
 @dataclass
@@ -41,8 +41,8 @@ class Hits:
     fields: dict[str, NDArray[Any]]
 
     def add(self, other: "Hits", where: NDArray[np.bool_]) -> None:
-        """Take the hits of others, in place, for some rays (H, F); fields that others lack are 0,
-        labels unknown."""
+        """Replace the hits of the rays ``where`` (H, F) by those of ``other``, in place; fields
+        that ``other`` lacks become 0, labels 255 = ignore."""
         count = len(next(iter(self.fields.values())))
         more = len(next(iter(other.fields.values())))
         for name in Nearest._fields:
@@ -80,7 +80,7 @@ def first_hits(
         upright: (3,) the upward direction in the frame of the rays.
     """
     scan = surfaces.scan
-    there = np.isfinite(points[:, 0])
+    finite = np.isfinite(points[:, 0])
     azimuth = -np.arctan2(points[:, 1], points[:, 0])
     rho = np.empty(len(points))
     rows = np.empty(len(points), np.int32)
@@ -88,16 +88,16 @@ def first_hits(
     vertices = Vertices(points, azimuth, rho, rows, scan.reflectance)
     triangles = (
         surfaces.triangles
-        if there.all()
-        else surfaces.triangles[there[surfaces.triangles].all(1)]
+        if finite.all()
+        else surfaces.triangles[finite[surfaces.triangles].all(1)]
     )
     size = len(rays.slope), rays.firings
-    nothing = np.zeros(size, np.float32)
+    zeros = np.zeros(size, np.float32)
     nearest = Nearest(
-        np.full(size, np.inf), np.zeros(size, np.int32), nothing, np.ones_like(nothing)
+        np.full(size, np.inf), np.zeros(size, np.int32), zeros, np.ones_like(zeros)
     )
     hit_triangles(vertices, triangles, rays, nearest)
-    rim = np.flatnonzero(surfaces.rim & there & (rho > 0.05))
+    rim = np.flatnonzero(surfaces.rim & finite & (rho > 0.05))
     shape = FootprintShape(
         scan.points, surfaces.level, surfaces.step / 2, surfaces.up, surfaces.down
     )

@@ -71,12 +71,13 @@ class Response:
 def _matched(
     recorded: NDArray[np.float32], target: NDArray[np.float32]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The arguments of ``Response`` that match the quantiles of reflectances (N,) and (M,)."""
     given = np.quantile(recorded, QUANTILES)
     gives = np.quantile(target, QUANTILES)
     values, first = np.unique(given, return_index=True)
     if len(values) < 2:
         return (0.0, 1.0), (float(gives.mean()),) * 2
-    # a value that many returns have
+    # A value with several quantiles gets their mean.
     means = [part.mean() for part in np.split(gives, first[1:])]
     return tuple(map(float, values)), tuple(map(float, means))
 

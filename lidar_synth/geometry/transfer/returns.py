@@ -12,16 +12,17 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.response import Response
 
 DARKEST = 0.02
-"""Reflectance that a return has at least, for the strength of its signal."""
+"""Minimum reflectance that is assumed for the strength of a signal."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """How the target sensor measures other than the recording one; not at all by default.
+    """How the measurements of the target sensor differ from those of the recording one; by default
+    they do not.
 
     Args:
-        range_noise: metres, standard deviation that is added to the range: of the target beyond
-            that of the source.
+        range_noise: metres, standard deviation of the noise that is added to the range: the part of
+            the target's noise that exceeds the recording sensor's.
         loss: share of returns that are lost at random, in [0, 1).
         reach: metres at which a surface of 10 % reflectance that faces the sensor returns every
             second ray; the signal falls with the square of the distance, with the reflectance and

@@ -23,16 +23,16 @@ from lidar_synth.geometry.transfer.kernels import (
 Integers = NDArray[np.int64]
 
 ORDERED = np.radians(2.0)
-"""Half of the steps of azimuth between successive points of a file that may be in ring order are
-smaller, radians."""
+"""Radians; a file may be in ring order if more than half of the steps of azimuth between successive
+points are smaller."""
 
 SAMPLES = 4096
 """Number of returns that decide whether a scan lies on rows or on beams."""
 
 TOGETHER = 0.1
-"""Neighbours along a ring of a range image that lie in one column are fewer than this share of
-those that lie in the next one: at most 0.02, where a ring passes through two rows; in scans of the
-HDL-64E 0.26 or more, also in those that lost 98 % of their returns."""
+"""A scan is a range image if neighbours along a ring in one column are fewer than this share of
+those in adjacent columns. It is at most 0.02 in range images, where a ring passes through two rows,
+and 0.26 or more in scans of the HDL-64E, even without 98 % of their returns."""
 
 SCATTERED = 0.1
 """Neighbours along a ring differ in elevation by less than this share of the gap between rings, in
@@ -147,12 +147,12 @@ def rings_of(scan: Scan) -> tuple[Integers, bool]:
     if len(scan.sensor.starts):
         return _rows_of(scan), True
     elevation = _elevations(scan)
-    some = elevation[:: 1 + len(elevation) // SAMPLES]
-    off = [
-        np.median(np.abs(some - s.row_elevations()[_row(some, s)]))
-        for s in (scan.sensor, lasers)
-    ]
-    on_grid = bool(off[0] <= off[1])
+    sample = elevation[:: 1 + len(elevation) // SAMPLES]
+    to_grid, to_lasers = (
+        np.median(np.abs(sample - sensor.row_elevations()[_row(sample, sensor)]))
+        for sensor in (scan.sensor, lasers)
+    )
+    on_grid = bool(to_grid <= to_lasers)
     return _row(elevation, scan.sensor if on_grid else lasers), on_grid
 
 

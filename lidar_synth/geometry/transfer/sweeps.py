@@ -21,10 +21,10 @@ def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
     """The returns of a sweep in the frame of a scan, each object where the scan has it.
 
     Returns in a box of the sweep move with the box to the one of the same ``instance`` in the scan.
-    Returns of other
-    vehicles and people are left out, because they may have moved: those in a box that the scan does
-    not have, and those labelled as movable in no box. All are left out if both sensors together do
-    not reach from one pose to the other: numbers of instances may mean other objects there.
+    Returns of other vehicles and people are left out, because they may have moved: those in a box
+    that the scan does not have, and those outside all boxes with a movable class. All returns are
+    left out if the poses are farther apart than the ranges of both sensors together: the same
+    instance may be another object there.
 
     Args:
         sweep: N returns, with a pose.
@@ -54,19 +54,20 @@ def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
     if sweep.boxes is None:
         return out
     inside = _widened(sweep.boxes).contain(sweep.points)
-    there = {} if scan.boxes is None else {int(n): box for n, box in _numbered(scan)}
+    boxes = {} if scan.boxes is None else dict(_numbered(scan))
     for held, instance, box in zip(
         inside, sweep.boxes.instance, sweep.boxes.values, strict=True
     ):
         out[held] = (
             np.nan
-            if int(instance) not in there
-            else _carried(points[held], box, there[int(instance)])
+            if int(instance) not in boxes
+            else _carried(points[held], box, boxes[int(instance)])
         )
     return out
 
 
 def _numbered(scan: Scan) -> list[tuple[int, NDArray[np.float32]]]:
+    """(instance, box (7,)) of the boxes of a scan with a known instance."""
     assert scan.boxes is not None
     return [
         (int(n), box)

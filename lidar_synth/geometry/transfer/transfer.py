@@ -199,12 +199,12 @@ class Transfer:
             )
         boxes = None if scan.boxes is None else self.mount.boxes(scan.boxes)
         pose = None if scan.pose is None else scan.pose @ self.mount.matrix
-        kept = {
+        unchanged = {
             name: getattr(scan, name)
             for name in ("image_path", "id", "domain", "provenance")
         }
         boxes = _with_returns(boxes, returns.points)
-        return replace(returns, boxes=boxes, pose=pose, **kept), surfaces
+        return replace(returns, boxes=boxes, pose=pose, **unchanged), surfaces
 
     def _without_vehicle(self, scan: Scan) -> Scan:
         """The scan without returns of the vehicle that carries its sensor, where the target has
@@ -214,14 +214,14 @@ class Transfer:
         along = np.abs(scan.points[:, 0])
         across = np.abs(scan.points[:, 1])
         above = scan.points[:, 2]
-        # Not the road beside a low sensor: a vehicle is at most 1.5 m below the sensor on it.
-        own = (
+        # The limit below keeps the road around a low sensor; a vehicle's returns are above it.
+        of_vehicle = (
             (along < self.vehicle[0] / 2)
             & (across < self.vehicle[1] / 2)
             & (above < 0)
             & (above > -1.5)
         )
-        return scan if not own.any() else scan[~own]
+        return scan if not of_vehicle.any() else scan[~of_vehicle]
 
     def _returns(self, hits: Hits, rays: Rays, rng: np.random.Generator) -> Scan:
         """The returns of the rays that hit something, row by row."""
@@ -281,11 +281,11 @@ class SeenAs:
 
     @property
     def identity(self) -> str:
-        """A text that tells it from other sources: the source, or the names of its scans, transfer
-        and seed."""
-        own = getattr(self.source, "identity", "") or type(self.source).__name__
+        """A text that distinguishes it from other sources, by source, names of scans, transfer and
+        seed."""
+        source = getattr(self.source, "identity", "") or type(self.source).__name__
         names = map(str, getattr(self.source, "ids", [identity_of(self.source)]))
-        digest = hash_of_names([own, *names, self.transfer.identity, str(self.seed)])
+        digest = hash_of_names([source, *names, self.transfer.identity, str(self.seed)])
         return f"{type(self).__name__}:{len(self)}:{digest[:16]}"
 
     def __len__(self) -> int:
@@ -307,14 +307,14 @@ def _with_returns(boxes: Boxes | None, points: NDArray[np.float32]) -> Boxes | N
 
 @lru_cache(maxsize=256)
 def _warn_of_differences(
-    given: Sensor, target: Sensor, pitch: float, unmatched: bool
+    source: Sensor, target: Sensor, pitch: float, unmatched: bool
 ) -> None:
-    """Say once what scans of the target will lack: lasers outside the field of view, and its own
-    reflectance."""
-    if given.name == target.name or target.same_lasers(given):
+    """Log once what scans of the target will lack: returns of lasers outside the recorded field of
+    view, and the target's reflectance."""
+    if source.name == target.name or target.same_lasers(source):
         return
     elevation = np.degrees(target.optics()[0]) - pitch
-    seen = np.degrees(given.optics()[0])
+    seen = np.degrees(source.optics()[0])
     blind = int(((elevation < seen.min() - 0.5) | (elevation > seen.max() + 0.5)).sum())
     lacks = []
     if blind:
@@ -327,7 +327,7 @@ def _warn_of_differences(
             "reflectance is the recording sensor's (like=FOLDER or --like matches it to real scans)"
         )
     if lacks:
-        log.warning("scans of %r as %r: %s", given.name, target.name, "; ".join(lacks))
+        log.warning("scans of %r as %r: %s", source.name, target.name, "; ".join(lacks))
 
 
 def _seen(surfaces: ScanSurfaces, target: Sensor, mount: Mount) -> float:
