@@ -42,10 +42,10 @@ class ClipViewEncoder(Encoder):
         nn.init.normal_(self.view_embedding, std=CLIP_WIDTH**-0.5)
         self.project = nn.Linear(CLIP_WIDTH, channels)
 
-    def forward(self, given: Tensor) -> Tensor:
-        """(B, 3, 224, 224 views) uint8, or what ``look`` makes of it, to (B, views, channels);
-        raises as ``look``."""
-        features = given if given.shape[1:] == self.seen else self.look(given)
+    def forward(self, cond: Tensor) -> Tensor:
+        """Images (B, 3, 224, 224 views) uint8, or their features by ``look``, to (B, views,
+        channels); raises as ``look``."""
+        features = cond if cond.shape[1:] == self.seen else self.look(cond)
         out: Tensor = self.project(
             features.to(self.project.weight.dtype) + self.view_embedding
         )

@@ -1,8 +1,8 @@
 """Autoencoder of dense range images that two CPU cores can train and decode.
 
 An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 16) in (-1, 1). The decoder works on
-patches of 2 x 8 cells and predicts what the cells of a patch can show (``surfaces``); only the last
-linear layer knows single cells, which makes it cheap.
+patches of 2 x 8 cells and predicts the surfaces that the cells of a patch can show (surfaces.py).
+It is cheap, because only its last linear layer works on single cells.
 """
 
 import copy
@@ -48,12 +48,12 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         resolution: H, W of the image, multiples of 4 and 16.
         channels: C of the image: range, reflectance, then ``bits``.
         bits: channels of the image that are an analog code (``normalize.encode_labels``).
-        codes: how many codes there are.
+        codes: number of codes.
         latent_channels: Z.
         encoder_widths: channels of the encoder on patches and on latent cells.
         widths: channels of the decoder on patches and on latent cells.
-        reaches: dilations of the decoder's blocks on latent cells, since a wall is straight over
-            many of them.
+        reaches: dilations of the decoder's blocks on latent cells; large ones, since walls are
+            straight over many cells.
         depth: blocks of the decoder on patches.
         surfaces: K of a patch, at most 4.
         normalisation: a name of ``NORMALISATIONS``, that of the range.
@@ -211,12 +211,12 @@ class SurfaceAutoencoder(BoundedAutoencoder):
             z = z + noise * torch.randn(z.shape, generator=generator)
             return Seen(x, _codes_of(x), network.expand(z))
 
-        found = measure_noise(
+        cell_noise = measure_noise(
             map(measured, images), self.codes, self.normalisation, generator
         )
-        self.roughness.copy_(found.roughness)
-        self.relief.copy_(found.relief)
-        self.alike.copy_(found.reflectance)
+        self.roughness.copy_(cell_noise.roughness)
+        self.relief.copy_(cell_noise.relief)
+        self.alike.copy_(cell_noise.reflectance)
 
     def decode(
         self,

@@ -1,5 +1,5 @@
-"""What a condition says of single cells: where objects may be and of which class, and classes that
-are given."""
+"""Constraints of a condition on single cells: where objects may be, their classes, and given
+classes."""
 
 from typing import NamedTuple
 
@@ -40,9 +40,9 @@ def bounds_of(
 ) -> Bounds:
     """The bounds of the cells of N patches.
 
-    Rays that meet no box have near = 1 and far = -1, and all rays of a blank image -1 and 1, since
-    nothing is known of them. A column that stands for several has what is in any of them, and the
-    class of the nearest box.
+    Rays that meet no box have near = 1 and far = -1. All rays of a blank image have -1 and 1, since
+    nothing is known about them. A column that replaces several has the boxes of all of them, and
+    the class of the nearest box.
 
     Args:
         layout: (B, 5, H, W) uint8, images of layouts.
@@ -65,8 +65,8 @@ def bounds_of(
     near, nearest = near.reshape(shape).min(3)
     labels = labels.reshape(shape).gather(3, nearest[..., None])[..., 0]
     parts = torch.stack([near, far.reshape(shape).amax(3), labels.float()], 1)
-    # Parked bicycles and motorcycles too: a layout does not say where one stands, and drawn
-    # anywhere it is a streak.
+    # Parked bicycles and motorcycles, too: layouts do not contain them, and elsewhere than in a box
+    # they would be drawn as streaks.
     kinds = torch.arange(codes, device=layout.device) <= TRAIN_ID["motorcyclist"]
     near, far, labels = to_patches(parts, patch).unbind(1)
     return Bounds(near, far, labels.long(), kinds)
@@ -75,7 +75,7 @@ def bounds_of(
 def codes_of(labels: Tensor, columns: int, patch: tuple[int, int]) -> Tensor:
     """(N, P) int64 classes of the cells of N patches, -1 where they are not known.
 
-    A column that stands for several has the class of the first of them that is known.
+    A column that replaces several has the first class of them that is known.
 
     Args:
         labels: (B, H, W) uint8 train ids, 255 = unknown.

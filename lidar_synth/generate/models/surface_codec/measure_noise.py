@@ -1,5 +1,5 @@
-"""How the noise of a codec's cells is divided: what differs from cell to cell, and what the cells
-of a patch share.
+"""The noise of a codec's cells, divided into what differs from cell to cell and what the cells of a
+patch share.
 
 The decoder predicts the distribution of every cell by itself. Neighbouring cells of a wall have the
 same error of the range and similar reflectances, leaves do not. Both follow from pairs of
@@ -36,7 +36,7 @@ from lidar_synth.geometry.normalize import Normalisation
 LEAST = 200
 """Pairs of cells that a class needs; others keep the mean of all classes."""
 PLANTS = TRAIN_ID["vegetation"], TRAIN_ID["terrain"]
-"""Classes with relief: what does not fit a plane is part of them. Walls have doubt in its place."""
+"""Classes with relief: their deviations from a plane are real. Those of walls are doubt."""
 LAGS = SPANS[0] // 2, SPANS[1] // 2
 """Columns between the pairs of cells by which relief is measured."""
 _LARGEST = 4.0  # error of a range in scales: beyond it, the cell shows another surface
@@ -44,7 +44,7 @@ _SURE = 1e-4
 
 
 class Seen(NamedTuple):
-    """An image and what a decoder says of it.
+    """An image and the surfaces that a decoder predicts for it.
 
     Args:
         image: (1, C, H, W).
@@ -80,27 +80,22 @@ def measure_noise(
         error, score, surface = _scores(
             surfaces, distance, value, kinds, normalisation, generator
         )
-        left, right = (
-            [
-                part.view(-1, *PATCH)[..., some]
-                for part in (error, score, surface, kinds, distance)
-            ]
-            for some in (slice(0, -1), slice(1, None))
-        )
-        same = (
-            (left[2] == right[2])
-            & (left[3] == right[3])
-            & (left[4] > -1)
-            & (right[4] > -1)
-        )
+        # (N, rows, columns - 1) of neighbours in a row of a patch
+        pairs = [
+            (part.view(-1, *PATCH)[..., :-1], part.view(-1, *PATCH)[..., 1:])
+            for part in (error, score, surface, kinds, distance)
+        ]
+        (error1, error2), (score1, score2), (surface1, surface2) = pairs[:3]
+        (kind1, kind2), (range1, range2) = pairs[3:]
+        same = (surface1 == surface2) & (kind1 == kind2) & (range1 > -1) & (range2 > -1)
         terms = [
-            torch.ones_like(left[0]),
-            (left[0] - right[0]).abs(),
-            left[1] * right[1],
-            left[1] ** 2,
+            torch.ones_like(error1),
+            (error1 - error2).abs(),
+            score1 * score2,
+            score1**2,
         ]
         for column, term in enumerate(terms):
-            sums[:, column] += torch.bincount(left[3][same], term[same].double(), codes)
+            sums[:, column] += torch.bincount(kind1[same], term[same].double(), codes)
         cells = torch.stack([error, kinds.float(), distance], 1)
         whole = from_patches(cells, PATCH, (x.shape[2], x.shape[3]))
         relief += _products(whole[:, 0], whole[:, 1], whole[:, 2], codes)
@@ -139,8 +134,8 @@ def _scores(
     middle, spread, blank = (pick(part) for part in surfaces.reflectance)
     zero = blank.sigmoid()
     below = zero + (1 - zero) * torch.sigmoid((value - middle) / spread.exp())
-    some = torch.rand(value.shape, generator=generator)
-    return error, _normal(torch.where(value <= -1, below * some, below)), shown
+    uniform = torch.rand(value.shape, generator=generator)
+    return error, _normal(torch.where(value <= -1, below * uniform, below)), shown
 
 
 def _products(error: Tensor, kinds: Tensor, distance: Tensor, codes: int) -> Tensor:
@@ -151,16 +146,9 @@ def _products(error: Tensor, kinds: Tensor, distance: Tensor, codes: int) -> Ten
     for lag in (0, *LAGS):
         same = inside & inside.roll(-lag, -1) & (kinds == kinds.roll(-lag, -1))
         products = (error * error.roll(-lag, -1))[same].double()
-        of = kinds[same].long()
-        sums.append(
-            torch.stack(
-                [
-                    torch.bincount(of, products, codes),
-                    torch.bincount(of, minlength=codes),
-                ],
-                1,
-            )
-        )
+        kind = kinds[same].long()
+        total = torch.bincount(kind, products, codes)
+        sums.append(torch.stack([total, torch.bincount(kind, minlength=codes)], 1))
     return torch.stack(sums, 1)
 
 

@@ -156,8 +156,8 @@ class Surfaces(NamedTuple):
         scale, dull, blank, likely, kind, patch = common.unbind(2)
         if codes is not None:
             # Above 0, for the signs of its bits.
-            own = self._of(codes).gather(1, chosen)[:, 0].exp().clamp_min(_SURE)
-            likely = torch.where(codes < 0, likely, own)
+            of_code = self._of(codes).gather(1, chosen)[:, 0].exp().clamp_min(_SURE)
+            likely = torch.where(codes < 0, likely, of_code)
             kind = torch.where(codes < 0, kind, codes)
         if bounds is not None:
             object_ = bounds.codes[kind.long()]
@@ -213,12 +213,11 @@ def _choose(shares: Tensor, which: Tensor) -> Tensor:
     return chosen
 
 
-def _mixed(own: Tensor, correlation: Tensor, shared: Tensor) -> Tensor:
+def _mixed(uniform_noise: Tensor, correlation: Tensor, shared: Tensor) -> Tensor:
     """Uniform numbers of cells, correlated by the standard normal numbers that they share (a
     Gaussian copula)."""
-    mixed: Tensor = torch.special.ndtr(
-        correlation.sqrt() * shared + (1 - correlation).sqrt() * to_normal(own)
-    )
+    single = (1 - correlation).sqrt() * to_normal(uniform_noise)
+    mixed: Tensor = torch.special.ndtr(correlation.sqrt() * shared + single)
     return mixed.clamp(_SURE, 1 - _SURE)
 
 
@@ -242,8 +241,8 @@ def surfaces_of(
         surfaces: K.
         classes: C.
         patch: rows and columns of a patch, P cells.
-        merged: neighbouring columns that become one, a divisor of the patch's: P / merged cells
-            then, each through the middle of those that it takes the place of.
+        merged: number of neighbouring columns that become one, a divisor of the patch's columns.
+            The P / merged cells are each at the middle of those that they replace.
     """
     rows, columns = patch
     whole, each = torch.split(
