@@ -102,7 +102,7 @@ def jitter(
 def drop_reflectance(scan: Scan, rng: np.random.Generator, chance: float = 1.0) -> Scan:
     """Set the reflectance to 0 with probability ``chance``: a network cannot tell domains by it.
 
-    Use it for real and synthetic scans alike, in training and, with ``chance=1``, in use.
+    Apply it to real and synthetic scans alike, in training and, with ``chance=1``, at inference.
     """
     if rng.random() >= check_share("chance", chance):
         return scan
@@ -178,6 +178,7 @@ def scale_scan(scan: Scan, factor: float) -> Scan:
 
 
 def _placed(scan: Scan, points: NDArray[np.float32], boxes: Boxes | None) -> Scan:
+    """The scan with moved points (N, 3) and boxes, which its pose and image no longer fit."""
     return replace(scan, points=points, boxes=boxes, pose=None, image_path=None)
 
 

@@ -45,7 +45,8 @@ MOST_BYTES = 1 << 32
 """Maximum size of a bank in memory: a hundred thousand objects of 2,500 points each."""
 
 MOST_PACKED = 64 << 20, 20
-"""How much a bank may unpack into: these bytes, and so many times the size of its file."""
+"""Maximum size of a file's arrays in memory: a number of bytes, plus a multiple of the file's
+size."""
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -125,7 +126,7 @@ class ObjectBank:
         }:
             raise DataError(f"objects: {wrong}", f"{types}")
         for name in ("ground", "points"):
-            if not (np.abs(getattr(self, name)) <= FARTHEST).all():  # NaN is not
+            if not (np.abs(getattr(self, name)) <= FARTHEST).all():  # false for NaN
                 raise DataError(
                     f"objects: {name} not finite, or too large",
                     f"metres within {FARTHEST:g}",
@@ -183,16 +184,18 @@ class ObjectBank:
         seed: int = 0,
         skin: str | Path | None = None,
     ) -> Any:
-        """Collect objects of the town, which cost no labels; ``paste`` casts each of them anew at
-        its place, by the rays of the scan that it is pasted into, with noise and losses.
+        """Collect objects of the town, which need no labelled scans.
+
+        ``paste`` casts each of them anew at its place, by the rays of the scan that it is pasted
+        into, with noise and lost returns.
 
         Args:
             sensor: of the scans that objects are pasted into.
             classes: names of boxes; by default all that the town has of KITTI's. Parked cycles and
                 motorcyclists, for whom KITTI has no name, are ``Bicycle``, ``Motorcycle`` and
                 ``Motorcyclist``.
-            scans: moments of the town whose objects are taken, about 12 each.
-            seed: of the town.
+            scans: number of scans of the town that objects are taken from, about 12 from each.
+            seed: seed of the town.
             skin: the look of a real sensor's returns, as ``load_skin`` takes it.
 
         Returns:
@@ -286,11 +289,9 @@ class ObjectBank:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of its file by name."""
-        names = [
-            f.name for f in fields(ObjectBank) if f.name not in ("sensor", "boxes")
-        ]
-        given = {name: getattr(self, name) for name in names}
-        arrays = {n: values for n, values in given.items() if values is not None}
+        arrays = {f.name: getattr(self, f.name) for f in fields(ObjectBank)}
+        del arrays["sensor"], arrays["boxes"]
+        arrays = {n: values for n, values in arrays.items() if values is not None}
         for f in fields(Boxes):
             arrays[f"box_{f.name}"] = np.asarray(getattr(self.boxes, f.name))
         arrays["format"] = np.array(FORMAT)
@@ -311,7 +312,7 @@ class ObjectBank:
 
     @property
     def identity(self) -> str:
-        """A text that tells banks apart, by their boxes."""
+        """A text that distinguishes banks by their boxes."""
         boxes = (*self.boxes.names, *map(str, self.boxes.values.flat))
         return f"{type(self).__name__}:{self.sensor.name}:{hash_of_names(boxes)[:16]}"
 

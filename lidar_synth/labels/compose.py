@@ -1,8 +1,8 @@
 """One augmentation made of several, which plain data such as YAML can name.
 
-A step is an augmentation, its name, or ``{name: {argument: value}}``, where ``[low, high]``
-is drawn from for every scan, ``severity`` names that of a corruption (of a list, one is
-drawn for every scan), and ``p`` is the probability of the step::
+A step is an augmentation, its name, or ``{name: {argument: value}}``. For every scan, a number is
+drawn from ``[low, high]`` and a name from a list of names. ``severity`` sets the strength of a
+corruption, and ``p`` is the probability of the step::
 
     - fog: {visibility: [50, 500], p: 0.3}
     - snow: {severity: [light, moderate], p: 0.3}
@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from inspect import signature
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from typing_extensions import Self
@@ -48,10 +48,10 @@ class Step:
     """One step of a ``Compose``.
 
     Args:
-        name: of ``MOVES``, ``CORRUPTIONS`` or ``MIXES``; "" for another function.
-        arguments: of it, as in plain data.
+        name: a name in ``MOVES``, ``CORRUPTIONS`` or ``MIXES``; "" for another function.
+        arguments: its arguments, as in plain data.
         p: probability in [0, 1].
-        call: what is called; None makes it from name and arguments for every scan.
+        call: the function to call; None makes it from name and arguments for every scan.
 
     Raises:
         ConfigError: on an unknown name or argument, or an invalid value.
@@ -64,7 +64,7 @@ class Step:
 
     def __post_init__(self) -> None:
         check_share("p", self.p)
-        if self.call is None:  # all that can be drawn is valid
+        if self.call is None:  # every value that may be drawn has to be valid
             lists = [v for v in self.arguments.values() if isinstance(v, list | tuple)]
             for n in range(max(map(len, lists), default=1)):
                 self._make(partial(_nth, n), check=True)
@@ -100,8 +100,11 @@ class Step:
         return {self.name: {**self.arguments, **chance}}
 
     def _make(self, pick: Callable[[Sequence[Any]], Any], check: bool = False) -> Any:
-        """The augmentation; ``pick`` takes one of the values that a list stands for. One of
-        ``MOVES`` checks its arguments when it is called."""
+        """The augmentation; ``pick`` takes one value out of a list.
+
+        ``check`` calls one of ``MOVES`` with one point, because these check their arguments only
+        when they are called.
+        """
         choose("augmentation", self.name, dict.fromkeys((*MOVES, *CORRUPTIONS, *MIXES)))
         if self.name in MIXES:
             return read_policy({self.name: self.arguments})
@@ -136,8 +139,8 @@ class Step:
 class Compose:
     """One augmentation that applies several in order, with one random generator.
 
-    ``scan.augmented`` tells what was drawn. A box that loses all its returns to a corruption is
-    dropped: nothing is left of its object to detect.
+    ``scan.augmented`` holds the values that were drawn. A box that loses all its returns to a
+    corruption is dropped: nothing is left of its object to detect.
 
     Args:
         steps: augmentations, their names, or ``{name: {argument: value, "p": chance}}``; a list
@@ -169,11 +172,11 @@ class Compose:
         return scan
 
     def bind(self, real: Source | None, fields: frozenset[str]) -> Self:
-        """The same with real scans to draw from."""
+        """The augmentation with real scans to draw from."""
         return type(self)([step.bind(real, fields) for step in self.steps])
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, from which ``from_dict`` makes the same.
+        """The augmentation as plain data, from which ``from_dict`` makes it again.
 
         Raises:
             ConfigError: on a step that is a function without a name.
@@ -195,7 +198,7 @@ class Compose:
 def make_augmentation(
     given: Any, real: Source | None, fields: frozenset[str]
 ) -> Augmentation:
-    """An augmentation from what ``MixedScans`` takes: itself, or what a ``Compose`` takes.
+    """The augmentation that the argument ``augment`` of ``MixedScans`` describes.
 
     Args:
         given: an augmentation, a step, a list of steps, or ``Compose.to_dict``.
@@ -205,13 +208,14 @@ def make_augmentation(
     Raises:
         ConfigError: as ``Compose``.
     """
-    made = given
+    augmentation: Any = given
     if isinstance(given, Mapping) and "compose" in given:
-        made = Compose.from_dict(given)
+        augmentation = Compose.from_dict(given)
     elif not callable(given) or isinstance(given, type | Corruption):
-        made = Compose(given)
-    augmentation: Augmentation = made
-    return made.bind(real, fields) if hasattr(made, "bind") else augmentation
+        augmentation = Compose(given)
+    if hasattr(augmentation, "bind"):
+        augmentation = augmentation.bind(real, fields)
+    return cast(Augmentation, augmentation)
 
 
 def read_step(given: Any) -> Step:
@@ -226,8 +230,8 @@ def read_step(given: Any) -> Step:
         return Step(given.lower())
     if type(given) in CORRUPTIONS.values():
         values = {f: getattr(given, f.name) for f in fields(given)}
-        own = {f.name: v for f, v in values.items() if v != f.default}
-        return Step(given.name, own)
+        changed = {f.name: v for f, v in values.items() if v != f.default}
+        return Step(given.name, changed)
     if isinstance(given, Mapping) and len(given) == 1:
         [(name, options)] = given.items()
         if isinstance(options, Mapping | None):
@@ -247,7 +251,7 @@ def read_step(given: Any) -> Step:
 
 
 def _check_choice(key: str, values: Sequence[Any]) -> Sequence[Any]:
-    """The values, which are names or [low, high]."""
+    """The values of a list, after checking that they are names or [low, high]."""
     kinds = set(map(type, values))
     numbers = kinds <= {int, float} and len(values) == 2 and values[0] <= values[1]
     if not numbers and kinds != {str}:
@@ -262,7 +266,7 @@ def _nth(n: int, values: Sequence[Any]) -> Any:
 
 
 def _draw(rng: np.random.Generator, values: Sequence[Any]) -> Any:
-    """Any of several names, or a number between two."""
+    """A random one of several names, or a random number between two."""
     if isinstance(values[0], str):
         return values[int(rng.integers(len(values)))]
     return float(rng.uniform(*values))

@@ -69,8 +69,8 @@ class Ground(NamedTuple):
 
 
 def ground_under(scan: Scan, box: NDArray[np.float32]) -> Ground | None:
-    """The ground under a box, found by the labels around it, or by the lowest returns if there are
-    no labels, or the scan has none of the ground.
+    """The ground under a box, found by the labels around it, or by the lowest returns if the scan
+    has no labels of the ground.
 
     Args:
         scan: N points.

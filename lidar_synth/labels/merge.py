@@ -18,11 +18,13 @@ def merge_scans(scan: Scan, others: Sequence[Scan]) -> Scan:
     """Append the points, labels and boxes of other scans to a scan.
 
     The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of
-    the first scan. Labels, confidence (1 for labels of scans without confidence) and instances
-    (those of their boxes, if points have none) are always set; instances of the other scans are
-    renumbered, and those of a scan without boxes that has the classes of a file, within which files
-    count. Rings are set if the first scan has them, as lasers of its sensor; boxes if any scan has
-    them, and so causes; times are dropped, as each scan has its own moment.
+    the first scan. Labels, confidence (1 for labels of scans without confidence) and instances are
+    always set; points without instances get those of their boxes. Rings are set if the first scan
+    has them, as lasers of its sensor; boxes and causes are set if any scan has them. Times are
+    dropped, because each scan has its own moment.
+
+    Instances of the other scans are renumbered; so are those of a scan with ``raw_label`` and
+    without boxes, because files count instances within each of their classes.
     """
     parts = [_complete(scan)]
     used = _last_instance(parts[0])
@@ -36,13 +38,13 @@ def merge_scans(scan: Scan, others: Sequence[Scan]) -> Scan:
     if any(p.cause is not None for p in parts):
         parts = [_with_causes(p) for p in parts]
         names.append("cause")
-    together: dict[str, Any] = {
+    merged: dict[str, Any] = {
         n: np.concatenate([getattr(p, n) for p in parts]) for n in ("points", *names)
     }
     boxes = [p.boxes for p in parts if p.boxes is not None]
     return replace(
         scan,
-        **together,
+        **merged,
         raw_label=None,
         time=None,
         boxes=join_boxes(boxes) if boxes else None,
@@ -66,6 +68,7 @@ def _with_causes(part: Scan) -> Scan:
 
 
 def _complete(scan: Scan) -> Scan:
+    """The scan with labels, confidence and instances."""
     label = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
     confidence = (
         (label != IGNORE).astype(np.float32)
@@ -74,13 +77,15 @@ def _complete(scan: Scan) -> Scan:
     )
     instance = _of_tracks(scan) if scan.instance is None else scan.instance
     if scan.instance is not None and scan.raw_label is not None and scan.boxes is None:
-        instance = number_instances(scan)  # boxes would lose theirs
+        instance = number_instances(
+            scan
+        )  # not with boxes, which refer to the old numbers
     return replace(scan, label=label, confidence=confidence, instance=instance)
 
 
 def _of_tracks(scan: Scan) -> NDArray[np.int32]:
-    """(N,) the instances of points that have none, by the boxes of tracks; without it these would
-    lose their points."""
+    """(N,) instances for the points of a scan without them, by its boxes with track ids, which
+    would otherwise lose their points."""
     instance = np.zeros(len(scan), np.int32)
     if scan.boxes is not None:
         for number in np.flatnonzero(scan.boxes.instance > 0):

@@ -49,8 +49,8 @@ class PasteObjects:
         turn: maximum angle, 0 to 180 degrees to either side, by which an object is turned
             about the sensor.
         clear: whether to remove the scan's own objects that have no box, and to fill the
-            holes; a detector would learn that they are background. "same", for a segmenter:
-            only those of the classes that are pasted, and a scan without boxes gets none.
+            holes; a detector would learn that they are background. "same", for a segmenter,
+            removes only those of the classes that are pasted, and gives a scan without boxes none.
         model: draws the holes, a generator, its name or file; None fills them by geometry,
             see ``edit.remove``.
         threshold: minimum confidence of the scan's own labels, 0 to 1; labels below it
@@ -236,14 +236,14 @@ class PolarMix(_RealMix):
         other = _draw_real(self.real, type(self).__name__, scan, rng)
         columns = scan.sensor.columns
         width = round(columns * self.width / 360)
-        own = keep_own(scan, rng, self.threshold)
-        mixed = swap_sector(own, other, int(rng.integers(columns)), width)
+        labelled = keep_own(scan, rng, self.threshold)
+        mixed = swap_sector(labelled, other, int(rng.integers(columns)), width)
         if self.objects:
             mixed = self._add_objects(mixed, other, rng)
         known = scan.label is not None or scan.boxes is not None
         if other.boxes is not None and known:
             return mixed
-        # With boxes, all other objects would be negatives.
+        # Boxes of some objects only would make all others negatives of a detector.
         return replace(mixed, boxes=None)
 
     def _add_objects(self, mixed: Scan, other: Scan, rng: np.random.Generator) -> Scan:
@@ -335,7 +335,7 @@ def _draw_real(
 
 
 def _first_labelled(real: Source | None, policy: str) -> Scan:
-    """The first of the real scans, which has labels."""
+    """The first of the real scans, after checking that it has labels."""
     check_source(real or ())
     if not real:
         raise _no_labels("no real scans", policy)

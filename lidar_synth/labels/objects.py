@@ -97,9 +97,8 @@ def instances_of(scan: Scan, least: int = 5) -> list[Object]:
     things = np.flatnonzero(scan.label < THINGS)
     which = number_instances(scan)[things]
     objects = []
-    for part in np.split(
-        things[np.argsort(which, kind="stable")], np.cumsum(np.bincount(which))
-    )[1:]:
+    ordered = things[np.argsort(which, kind="stable")]
+    for part in np.split(ordered, np.cumsum(np.bincount(which)))[1:]:
         if len(part) >= least:
             box = _enclose(scan.points[part])
             objects.append(_object(scan, part, Boxes(box, ("Misc",))))
@@ -110,14 +109,14 @@ def number_instances(scan: Scan) -> NDArray[np.int32]:
     """(N,) the instances of a scan as 1, 2, ..., 0 = none.
 
     Files count instances within each of their classes: a parked car and a moving one of
-    SemanticKITTI may both have number 1. Without their classes, those of the labels are used.
+    SemanticKITTI may both have number 1. Without ``raw_label``, the classes are those of ``label``.
     """
     assert scan.instance is not None
     kind: Any = scan.label if scan.raw_label is None else scan.raw_label
-    there = np.flatnonzero(scan.instance > 0)
-    keys = scan.instance[there].astype(np.int64) << 32 | kind[there]
+    some = np.flatnonzero(scan.instance > 0)
+    keys = scan.instance[some].astype(np.int64) << 32 | kind[some]
     numbers = np.zeros(len(scan), np.int32)
-    numbers[there] = np.unique(keys, return_inverse=True)[1] + 1
+    numbers[some] = np.unique(keys, return_inverse=True)[1] + 1
     return numbers
 
 
@@ -177,6 +176,7 @@ def _standing(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
 
 
 def _object(scan: Scan, mine: NDArray[np.intp], box: Boxes) -> Object:
+    """The object of some returns (n,) of a scan, with its one box."""
     [values] = box.values
     ground = ground_under(scan, values)
     label = LABELS.get(box.names[0], IGNORE)

@@ -185,9 +185,9 @@ def check_own(threshold: float, fields: frozenset[str]) -> None:
     Raises:
         ConfigError: on a threshold that is not from 0 to 1, or for labels without confidence.
     """
-    own = KeepLabels(threshold)
+    policy = KeepLabels(threshold)
     if "label" in fields:
-        own.bind(None, fields)
+        policy.bind(None, fields)
 
 
 def label_of(scan: Scan) -> NDArray[np.uint8]:

@@ -98,9 +98,9 @@ def show_objects(
 def _fit(scan: Scan, candidate: Object, placed: list[Object]) -> Object | None:
     """The object placed on the ground of the scan; None if there is no suitable place."""
     box = candidate.box
-    taken = [o.box for o in placed] + (
-        [] if scan.boxes is None else list(scan.boxes.values)
-    )
+    taken = [o.box for o in placed]
+    if scan.boxes is not None:
+        taken += list(scan.boxes.values)
     if taken and find_overlapping(widen_boxes(box, CLEARANCE), np.array(taken)).any():
         return None
     ground = ground_under(scan, box)
@@ -121,7 +121,7 @@ def _raised(candidate: Object, height: float, sensor: Sensor) -> Object:
     if candidate.cast is not None:
         return Object(candidate.cast(boxes, sensor), height)
     points = candidate.scan.points + lift
-    # Other lasers see it there.
+    # No rings: at another height, other lasers see it.
     return Object(
         replace(candidate.scan, points=points, ring=None, boxes=boxes), height
     )
@@ -162,7 +162,7 @@ def still_visible(
         return seen, Boxes(np.zeros((0, 7), np.float32), ())
     removed = np.zeros(len(scan.boxes), bool)
     share = np.ones(len(scan.boxes))
-    # The few boxes that lose returns; to look into all of them would take longer than to paste.
+    # Only the few boxes that lose returns: examining all would take longer than pasting.
     losing = np.flatnonzero(standing(scan[~seen], scan.boxes).any(1))
     inside = standing(scan, scan.boxes[losing])
     after = (inside & seen).sum(1)

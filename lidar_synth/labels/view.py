@@ -81,9 +81,8 @@ class Composition:
         outline = _outline(row, column, distance[nearest], self.sensor.columns)
         limit = np.full(self.sensor.shape, np.inf, np.float32)
         limit[outline[0], outline[1]] = outline[2]
-        limit[row[seen], column[seen]] = (
-            0  # no other return shares a cell with it, not even ground just in front
-        )
+        # No other return shares a cell with it, not even ground just in front.
+        limit[row[seen], column[seen]] = 0
         for part in self.parts:
             part.seen &= (part.range <= limit.reshape(-1)[part.cell]) | (part.cell < 0)
         self._stand(*outline, top=placed.box[2] + placed.box[5] / 2)
@@ -99,6 +98,7 @@ class Composition:
         depth: Floats,
         top: np.float32,
     ) -> None:
+        """Put cells (m,) at a depth in front of what is behind them, up to the height ``top``."""
         nearer = depth < self._front[row, column]
         self._front[row[nearer], column[nearer]] = depth[nearer]
         self._height[row[nearer], column[nearer]] = top
@@ -117,7 +117,8 @@ def refuse_coarser(given: Sensor, wanted: Sensor) -> None:
         raise DataError(
             f"returns of sensor {given.name!r} for a scan of {wanted.name!r}",
             "those of a sensor with at least as many beams and columns",
-            f"Open them with sensor={wanted.name!r}, if of the same device, else with as_sensor.",
+            f"Open them with sensor={wanted.name!r} if they are of the same device, otherwise with "
+            "as_sensor.",
         )
 
 

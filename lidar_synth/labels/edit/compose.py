@@ -54,19 +54,19 @@ def replace_returns(
 def next_instance(scan: Scan) -> int:
     """The first instance number that neither points nor boxes of a scan have, in any class of
     KITTI-360, whose numbers are id * ``MAX_INSTANCES`` + n."""
-    given = [] if scan.instance is None else [scan.instance]
-    given += [] if scan.boxes is None else [scan.boxes.instance]
-    used = np.unique(np.concatenate([[0], *given]))
+    numbers = [] if scan.instance is None else [scan.instance]
+    numbers += [] if scan.boxes is None else [scan.boxes.instance]
+    used = np.unique(np.concatenate([[0], *numbers]))
     taken = np.concatenate([used, used % MAX_INSTANCES])
     return int(np.setdiff1d(np.arange(len(taken) + 1), taken)[0])
 
 
 def _place(rays: ScanRays, which: NDArray[np.intp]) -> NDArray[np.int64]:
     """(n,) the return on each ray, or else the last one before it in the order of the rays."""
-    there = np.maximum.accumulate(
+    latest = np.maximum.accumulate(
         np.where(rays.point >= 0, np.arange(len(rays.point)), 0)
     )
-    return rays.point[there[which]]
+    return rays.point[latest[which]]
 
 
 def _raw(kept: Scan, new: Scan, order: NDArray[np.intp]) -> NDArray[np.uint32] | None:

@@ -4,9 +4,9 @@ A ring is continued over the hole from both sides. If both are one surface, its 
 rho is interpolated: on the ground 1 / rho linearly in azimuth, else as on a plane wall, 1 / rho = a
 cos(azimuth) + b sin(azimuth). Otherwise each side is continued to the middle. Deviations from it,
 lost returns, reflectance and labels are copied from the rays beside the hole, mirrored at its edge.
-Nothing but ground can be where the object stood: an estimate just inside is moved to where the ray
-leaves that place; in place of another, the next surface beside the hole that is farther away is
-copied, and without one there is no return.
+Only ground can be where the object stood. An estimate just inside that place is moved to where the
+ray leaves it. One farther inside is replaced by a copy of the next surface beside the hole that is
+farther away; if there is none, there is no return.
 """
 
 from typing import NamedTuple
@@ -38,8 +38,8 @@ WIDE = 1.5
 """Radians from which on a hole is too wide for a wall that only one of its sides shows."""
 
 INSIDE = 0.5
-"""Metres by which an estimate may lie inside the place of the object to be moved to where the ray
-leaves it."""
+"""Maximum depth inside the place of the object, metres, from which an estimate is moved to where
+the ray leaves it."""
 
 _BASE = 12  # rays between the two places that give the direction of a wall
 _SMOOTH = 2  # rays to either side over which a distance is averaged

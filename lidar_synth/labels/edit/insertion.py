@@ -129,14 +129,19 @@ def _set(
     estimated: NDArray[np.bool_],
     instance: int = -1,
 ) -> Scan:
-    """Set an object into a scan at its place; it replaces (N,) estimated returns, whatever their
-    distance. Its instance is a new one, if points of the scan have instances, unless it is
-    known."""
+    """Set an object into a scan at its place.
+
+    Args:
+        scan, item, least: see ``insert``.
+        placed: the place.
+        estimated: (N,) True for estimated returns, which the object replaces at any distance.
+        instance: of the object; 0 or less takes a new one if the scan has instances.
+    """
     rays = rays_of_scan(scan)
     window = np.flatnonzero(rays.through(placed.box, margin=0.3))
     rho, hits, at = _hits(item, placed, rays, window)
-    guess = (rays.point[window] >= 0) & estimated[rays.point[window]]
-    seen = np.isfinite(rho) & (guess | (rho < rays.rho[window] - GRAZE))
+    replaceable = (rays.point[window] >= 0) & estimated[rays.point[window]]
+    seen = np.isfinite(rho) & (replaceable | (rho < rays.rho[window] - GRAZE))
     if seen.sum() < least:
         raise DataError(
             f"an object at {_place_text(placed.box)} with {seen.sum()} visible returns of "
@@ -162,15 +167,15 @@ def _set(
     )
     assert item.scan.boxes is not None
     values = grow_box(placed.box, new.points)[None]
-    own = Boxes(
+    box = Boxes(
         values,
         item.scan.boxes.names,
         occlusion=item.scan.boxes.occlusion.copy(),
         instance=np.array([instance], np.int32),
     )
-    own = update_occlusion(own, np.array([seen.sum() / np.isfinite(rho).sum()]))
+    box = update_occlusion(box, np.array([seen.sum() / np.isfinite(rho).sum()]))
     result = replace_returns(scan, ~remaining, rays, which, new)
-    return replace(result, boxes=join_boxes([boxes, own]))
+    return replace(result, boxes=join_boxes([boxes, box]))
 
 
 def move(
@@ -187,8 +192,8 @@ def move(
     Args:
         scan: N points with boxes.
         box: the number of the object's box.
-        pose, least: see ``insert``. What is only estimated behind the object does not stand in its
-            way.
+        pose, least: see ``insert``. Returns that are only estimated behind the object do not block
+            its new place.
         model, seed: see ``remove``.
 
     Returns:
@@ -241,12 +246,12 @@ def cut_out(scan: Scan, box: int) -> Object:
     select_boxes(scan, box)
     ring = rings_of(scan)[0]
     scan = replace(scan, ring=ring.astype(np.int16), sensor=as_fired(scan, ring))
-    found = objects_of(scan, least=1)
-    if box not in found:
+    objects = objects_of(scan, least=1)
+    if box not in objects:
         raise DataError(
             f"box {box} of scan {scan.id!r} without a return", "a box with an object"
         )
-    return found[box]
+    return objects[box]
 
 
 def _place(
@@ -259,10 +264,11 @@ def _place(
     """The object at its pose on the ground.
 
     Args:
-        scan: what must not stand in its way.
+        scan: the scan, without the object.
         item, pose: see ``insert``.
-        ground_of: shows the ground; by default the scan.
-        gone: number of a box that was taken out of the scan; later ones have one less.
+        ground_of: the scan in which the ground is found; by default ``scan``.
+        gone: number of a box that was removed from the scan, so that errors number later boxes as
+            before.
     """
     old = item.box.astype(np.float64)
     x, y, yaw = _complete(old, pose)
@@ -312,7 +318,8 @@ def _place(
 
 
 def _recorded_here(scan: Scan, item: Object, box: NDArray[np.float32]) -> bool:
-    """Whether an object returns to its own place in its own scan, where its returns are no more."""
+    """Whether an object returns to its own place in its own scan, from which its returns were
+    removed."""
     same = item.scan.id == scan.id and bool(
         np.allclose(box[[0, 1, 6]], item.box[[0, 1, 6]], atol=1e-3)
     )
@@ -320,11 +327,12 @@ def _recorded_here(scan: Scan, item: Object, box: NDArray[np.float32]) -> bool:
 
 
 def _shared(scan: Scan, other: Scan) -> NDArray[np.bool_]:
-    """(N,) which points of a scan another one has too."""
-    one, two = (
+    """(N,) which points of a scan the other one has, too."""
+    # 12 bytes as one value: x, y and z are compared together.
+    ours, theirs = (
         np.ascontiguousarray(s.points).view("V12").ravel() for s in (scan, other)
     )
-    return np.isin(one, two)
+    return np.isin(ours, theirs)
 
 
 def _complete(old: Floats, pose: Pose | None) -> tuple[float, float, float]:
@@ -382,12 +390,8 @@ def _hits(
         surfaces, placed.points(surfaces.scan.points), raster, np.array([0.0, 0.0, 1.0])
     )
     if len(window):
-        firing = (
-            np.rint((rays.azimuth[window] - raster.first[which]) / rays.step).astype(
-                np.intp
-            )
-            % count
-        )
+        turn = rays.azimuth[window] - raster.first[which]
+        firing = np.rint(turn / rays.step).astype(np.intp) % count
         at = np.stack([which, firing], 1)
         rho = hits.nearest.rho[which, firing]
         points = rays.points(window, np.where(np.isfinite(rho), rho, 0.0))

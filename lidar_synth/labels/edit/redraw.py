@@ -68,14 +68,13 @@ def redraw_hole(
     from lidar_synth.generate.inpaint import check_model, inpaint
 
     check_model(model, kept.sensor)
-    there = np.linalg.norm(filled.points, axis=1) > 0
-    asked = np.where(
-        there[:, None], filled.points, rays.points(which, np.full(len(which), FAR))
-    )
+    returned = np.linalg.norm(filled.points, axis=1) > 0
+    far = rays.points(which, np.full(len(which), FAR))
+    points = np.where(returned[:, None], filled.points, far)
     everything = locate(
         np.concatenate([kept.points, filled.points]).astype(np.float32), kept.sensor
     )
-    cell = locate(asked.astype(np.float32), kept.sensor).cell
+    cell = locate(points.astype(np.float32), kept.sensor).cell
     known = everything.point >= 0
     distance = np.where(known, everything.range[everything.point], 0).astype(np.float32)
     both = _joined(kept, filled)
@@ -125,7 +124,7 @@ def _on_rays(
     if label is not None:
         slope = rays.slope[which]
         meets = (z - rays.height[which]) / np.where(np.abs(slope) < 1e-3, -1e-3, slope)
-        # it may draw a new object
+        # The model may draw a new object, which is not taken.
         inside = inside & ~(label.reshape(-1)[cell] < THINGS)
         level = GROUND[label.reshape(-1)[cell]] & (np.abs(meets - rho) < BEND * rho)
         rho = np.where(level, meets, rho)

@@ -180,14 +180,14 @@ def remove_returns(
     if not removed.any():
         return scan
     rays = rays_of_scan(scan)
-    there = rays.point >= 0
-    hole = there & removed[rays.point]
-    near = np.full(len(there), np.inf)
-    far = np.zeros(len(there))
+    returned = rays.point >= 0
+    hole = returned & removed[rays.point]
+    near = np.full(len(hole), np.inf)
+    far = np.zeros(len(hole))
     near[hole] = rays.rho[hole]
     for mine, box in parts:
         if mine.any():
-            absorbed = ~there & rays.through(box, MARGIN)
+            absorbed = ~returned & rays.through(box, MARGIN)
             near[absorbed] = np.minimum(
                 near[absorbed], np.hypot(*scan.points[mine, :2].T).min()
             )
@@ -206,15 +206,15 @@ def remove_returns(
 
 
 def _ground(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:
-    """(E,) True for returns of the ground: by their labels, or without labels of the ground where a
-    ring is level and low."""
+    """(E,) True for returns of the ground: by their labels, or, without labels of the ground, by
+    their height."""
     ground = np.zeros(len(rays.point), bool)
-    there = rays.point >= 0
+    returned = rays.point >= 0
     if has_ground(scan.label):
-        ground[there] = GROUND[scan.label[rays.point[there]]]
+        ground[returned] = GROUND[scan.label[rays.point[returned]]]
     else:
         low = np.percentile(scan.points[:, 2], 10) + 0.5 if len(scan) else 0.0
-        ground[there] = scan.points[rays.point[there], 2] < low
+        ground[returned] = scan.points[rays.point[returned], 2] < low
     return ground
 
 
@@ -235,11 +235,11 @@ def _copies(
     donor: NDArray[np.int64],
     rho: NDArray[np.float64],
 ) -> Scan:
-    """One point for each ray of the hole, with the fields of its source, ignored if that has no
-    return; points at the origin have no return."""
-    found = np.isfinite(rho)
+    """One point for each ray (n,) of the hole, with the fields of the ray that it is copied from,
+    labels 255 = ignore if that has no return. Points at the origin are no returns."""
+    finite = np.isfinite(rho)
     points = np.where(
-        found[:, None], rays.points(which, np.where(found, rho, 0.0)), np.float32(0)
+        finite[:, None], rays.points(which, np.where(finite, rho, 0.0)), np.float32(0)
     )
     distance = np.linalg.norm(points, axis=1)
     near = distance < scan.sensor.range_min
@@ -249,7 +249,7 @@ def _copies(
     fields: dict[str, Any] = {"points": points.astype(np.float32)}
     if scan.instance is not None:
         fields["instance"] = np.zeros(len(which), np.int32)
-    # A model may draw a return there.
+    # Also for points without a return, as a model may draw one there.
     unknown = {"label": IGNORE, "raw_label": 0, "confidence": 0, "cause": 0}
     for name in unknown.keys() & scan.fields().keys():
         values = getattr(copies, name)

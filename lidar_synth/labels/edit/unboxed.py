@@ -113,13 +113,13 @@ def measure(
         points = (
             0 if scan.label is None else int(np.isin(scan.label, list(classes)).sum())
         )
-        found = (
+        counts = (
             1,
             int(clusters(scan, classes, least).max(initial=0)),
             points,
             int(_outside(scan, classes).sum()),
         )
-        total = Unboxed(*(a + b for a, b in zip(total, found, strict=True)))
+        total = Unboxed(*(a + b for a, b in zip(total, counts, strict=True)))
     return total
 
 
@@ -154,18 +154,18 @@ class Refusal:
             raise DataError(
                 f"synthetic scan {scan.id!r} with {count} objects without a box",
                 "a box for every object of " + ", ".join(NAMES[c] for c in BOXED),
-                "unboxed='close' removes them and fills the holes; unboxed='keep' hands them out.",
+                "unboxed='close' removes them and fills the holes; unboxed='keep' keeps them.",
             )
         return scan
 
 
-def _kept(scan: Scan) -> Scan:
+def _keep(scan: Scan) -> Scan:
     return scan
 
 
 HANDLING: dict[str, Callable[[Scan], Scan]] = {
     "close": remove_unboxed,
-    "keep": _kept,
+    "keep": _keep,
     "error": Refusal(),
 }
 """What is done to unboxed objects of scans with boxes, by name."""
