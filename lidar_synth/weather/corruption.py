@@ -1,10 +1,10 @@
-"""What all corruptions have in common: severities, and what becomes of labels and boxes.
+"""What all corruptions share: severities, and the treatment of labels and boxes.
 
-A corruption says which point of the given scan each of its points comes from, and why it
-is where it is. A point keeps the label, ring and time of the point that its ray had.
-Where the ray met no surface but a drop, a flake or another sensor's pulse, the label is
-255 = ignore. Boxes stay; one that held returns and holds none any more gets the
-occlusion 3 (unknown). ``Compose`` drops it.
+A corruption gives for each of its points the point of the original scan on the same ray,
+and the cause of the return. The point keeps the label, ring and time of the original one.
+If the ray met no surface but a drop, a flake or another sensor's pulse, the label is
+255 = ignore. Boxes stay; a box that loses all its returns gets the occlusion 3 (unknown),
+and ``Compose`` drops it.
 """
 
 from abc import ABC, abstractmethod
@@ -108,9 +108,9 @@ class Corruption(ABC):
         changed: dict[str, Any] = {"cause": np.where(lost, change.cause, earlier)}
         marks = {"label": self.noise_label, "raw_label": 0, "instance": 0}
         for name, value in {**marks, "confidence": 0}.items():
-            given = getattr(new, name)
-            if given is not None:
-                changed[name] = np.where(lost, given.dtype.type(value), given)
+            values = getattr(new, name)
+            if values is not None:
+                changed[name] = np.where(lost, values.dtype.type(value), values)
         result = replace(
             new, points=change.points, reflectance=change.reflectance, **changed
         )
@@ -130,7 +130,7 @@ def keep_points(scan: Scan, keep: NDArray[np.bool_]) -> Change:
 
 
 def rings_of(scan: Scan) -> NDArray[np.int64]:
-    """(N,) beams of the points: their rings, or as their directions tell.
+    """(N,) the beam of each point, 0 = highest: its ring, or the beam nearest to its direction.
 
     Raises:
         DataError: on rings that the sensor does not have.

@@ -83,15 +83,15 @@ def place_plumes(scan: Scan) -> NDArray[np.float32]:
         named = np.isin(scan.boxes.names, VEHICLES)
         vehicles = np.concatenate([OWN, scan.boxes.values[named]])
     length, wider, high = PLUME
-    found = vehicles.copy()
+    plumes = vehicles.copy()
     back = (vehicles[:, 3] + length) / 2
-    found[:, 0] -= back * np.cos(vehicles[:, 6])
-    found[:, 1] -= back * np.sin(vehicles[:, 6])
-    found[:, 3] = length
-    found[:, 4] += wider
-    found[:, 5] *= high
-    away = np.linalg.norm(found[:, :2], axis=1)
-    return found[np.argsort(away)][: (away < FARTHEST).sum()]
+    plumes[:, 0] -= back * np.cos(vehicles[:, 6])
+    plumes[:, 1] -= back * np.sin(vehicles[:, 6])
+    plumes[:, 3] = length
+    plumes[:, 4] += wider
+    plumes[:, 5] *= high
+    away = np.linalg.norm(plumes[:, :2], axis=1)
+    return plumes[np.argsort(away)][: (away < FARTHEST).sum()]
 
 
 def cross_box(
@@ -109,7 +109,7 @@ def cross_box(
     """
     centre = box[:3]
     half = box[3:6] / 2
-    # From outside of the sphere of its corners, rays beside that do not meet it.
+    # If the sensor is outside the sphere through the corners, rays beside the sphere miss the box.
     outside = float(centre @ centre - half @ half)
     tangent = np.float32(np.sqrt(max(outside, 0)))
     rays = np.flatnonzero((points @ centre >= distance * tangent) | (outside < 0))

@@ -15,14 +15,14 @@ angle d fills the share (D / (r d))^2 of it, so that its signal is ::
 
     S = q (D / d)^2 / r^4
 
-More than S have all those that are nearer than r(D, S). As many as lie in the beam's cone
-up to there are expected, in all the diameters together ::
+All particles nearer than r(D, S) have a signal of more than S. The expected number of them
+in the beam's cone, over all diameters, is ::
 
     k(S) = (pi / 12) d^2 (q / (d^2 S))^(3/4) int D^(3/2) n(D) dD
 
-and the strongest one on a ray is that for which k is a standard exponential number. The
-receiver's view of the beam near the sensor (``signal.overlap``) is applied to that one after
-the draw, though it may make another one the strongest: the draw is exact without it.
+The strongest particle on a ray has the signal for which k is a standard exponential random
+number. The receiver's view of the beam near the sensor (``signal.overlap``) is applied after
+the draw. This is an approximation, as it may make another particle the strongest.
 """
 
 from abc import abstractmethod
@@ -40,14 +40,14 @@ from lidar_synth.weather.signal import SignalLoss, overlap, ranges_of
 Floats = NDArray[np.float64]
 
 WAVELENGTH = 905e-6
-"""mm."""
+"""Wavelength of the laser, mm."""
 DIVERGENCE = 3e-3
 """Full angle d of the beam, radians (HDL-64E)."""
 DIAMETERS = np.linspace(0.05, 10, 400)
-"""Of particles, mm; a sensor does not see smaller ones."""
+"""Diameters D of particles, mm; a sensor does not see smaller ones."""
 FLAKE = 10 ** (1 / 3)
-"""Diameter of a flake by that of the drop to which it melts, which is Gunn and Marshall's
-D: snow has a tenth of the density of water."""
+"""Ratio of the diameter of a flake to that of the drop to which it melts, which is Gunn and
+Marshall's D: snow has a tenth of the density of water."""
 _STEP = DIAMETERS[1] - DIAMETERS[0]
 _LEVELS = (np.arange(1024) + 0.5) / 1024
 
@@ -88,7 +88,7 @@ class Precipitation(SignalLoss):
         soft = self.reflectance * filled * overlap(place) / place**2
         soft *= np.exp(loss * place)
         in_front = place < distance
-        # The strongest particle is in the way of the rest of the pulse, too.
+        # The strongest particle also blocks its share of the pulse.
         left = np.exp(loss * distance) * (1 - filled * in_front)
         return self.strongest(scan, distance, left, soft * in_front, place, rng)
 

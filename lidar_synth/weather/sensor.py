@@ -1,5 +1,5 @@
-"""What goes wrong in the sensor, as the Robo3D benchmark (Kong et al., ICCV 2023)
-defines it; low power is the package's own."""
+"""Failures of the sensor as the Robo3D benchmark (Kong et al., ICCV 2023) defines them,
+and ``LowPower``, which it does not have."""
 
 from dataclasses import dataclass
 
@@ -82,7 +82,7 @@ class MissingBeams(Corruption):
 
     share: float
     name = "missing_beams"
-    # 16, 32 and 48 failures, each of any of 64 beams, also of one that has failed.
+    # As 16, 32 and 48 failures among 64 beams, where a beam may be drawn more than once.
     SEVERE = {"share": 0.223}, {"share": 0.396}, {"share": 0.53}
 
     def __post_init__(self) -> None:
@@ -96,10 +96,10 @@ class MissingBeams(Corruption):
 
 @dataclass(frozen=True)
 class CrossSensor(Corruption):
-    """A sensor with fewer beams, and returns along them: evenly spaced ones stay.
+    """A sensor with fewer beams, and fewer returns along each: evenly spaced ones stay.
 
     Args:
-        share: of the beams that stay, in (0, 1].
+        share: share of the beams that stay, in (0, 1].
         along: share of the returns of a beam that stay, in (0, 1].
 
     Raises:
@@ -134,7 +134,7 @@ class CrossSensor(Corruption):
 
 @dataclass(frozen=True)
 class Crosstalk(Corruption):
-    """Pulses of other beams or sensors: some points are somewhere else.
+    """Pulses of other beams or sensors: some points are displaced at random.
 
     Args:
         share: of the points, in [0, 1].
@@ -215,7 +215,7 @@ class LowPower(SignalLoss):
     """A laser that has lost power: weak returns are not detected.
 
     Args:
-        power: what is left of it, in (0, 1].
+        power: share of the power that is left, in (0, 1].
 
     Raises:
         ConfigError: on another power.
@@ -244,7 +244,7 @@ class LowPower(SignalLoss):
 def _number_along(
     rings: NDArray[np.int64], points: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """(N,) numbers of points, counted along one beam after the other."""
+    """(N,) the number of each point, counted along one beam after the other."""
     turn = np.arctan2(points[:, 1], points[:, 0]) * np.float32(32_767 / np.pi)
     # Stable sorts of 16 bits are by far the fastest.
     order = np.argsort(turn.astype(np.int16), kind="stable")

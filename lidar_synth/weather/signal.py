@@ -1,4 +1,4 @@
-"""The signal of returns: what attenuation leaves of it, and what particles add.
+"""The signal of returns, its attenuation, and the signal of particles.
 
 The signal of a surface of reflectance p at range R is p / R^2. Of the surface and of
 the particles in front of it, a sensor reports the stronger one, if it is stronger than
@@ -21,13 +21,13 @@ from lidar_synth.weather.corruption import (
 )
 
 FLOOR = 5e-5
-"""Least signal that a sensor detects, 1 / m^2: the HDL-64E sees 10 % at 50 m and 80 % at
+"""Minimum signal that a sensor detects, 1 / m^2: the HDL-64E sees 10 % at 50 m and 80 % at
 120 m (Velodyne's data sheet)."""
 DARKEST = 0.05
-"""Reflectance that a return reported as 0 may have had."""
+"""Minimum reflectance that is assumed for a return; some are reported with 0."""
 OVERLAP = 0.9, 12.0
-"""Ranges from which a receiver beside the laser begins to see, and wholly sees, the beam,
-metres. Haze with a visibility of hundreds of metres is then not detected."""
+"""Ranges in metres from which a receiver beside the laser sees a part of the beam, and all
+of it. Haze with a visibility of hundreds of metres is then not detected."""
 
 
 def ranges_of(scan: Scan) -> Values:
@@ -38,12 +38,12 @@ def ranges_of(scan: Scan) -> Values:
 
 
 def signal_of(scan: Scan, distance: Values, rng: np.random.Generator) -> Values:
-    """(N,) signals in clear air, at least ``FLOOR``: what was recorded was strong enough.
+    """(N,) signals in clear air, at least ``FLOOR``, because the returns were detected.
 
-    The reported reflectances put many far returns below it. How far above it these were
-    is not known: so each signal is at least that of an excess drawn from an exponential
-    distribution of mean ``FLOOR``, about that of the far returns above it. The lighter
-    the weather, the fewer it removes.
+    By their reported reflectances, many far returns would be below the floor; how far they
+    were above it is not known. Each signal is therefore at least ``FLOOR`` plus an excess
+    from an exponential distribution of mean ``FLOOR``, which is about the mean excess of the
+    far returns above it. Light weather then removes few of them.
     """
     bright = np.maximum(scan.reflectance, np.float32(DARKEST))
     excess = rng.standard_exponential(len(scan), np.float32)
@@ -64,8 +64,8 @@ class SignalLoss(Corruption):
     Args:
         compensated: share, in [0, 1], of a loss in decibels that the sensor's automatic
             power and gain make up for in the reflectance that it reports; 0 for a sensor
-            that reports the signal. By default as a network that learnt in clear air
-            loses on average in the Robo3D benchmark.
+            that reports the signal. With the default, a network trained in clear air loses
+            as much as on average in the Robo3D benchmark.
     """
 
     compensated: float = field(default=0.7, kw_only=True)
@@ -77,11 +77,11 @@ class SignalLoss(Corruption):
         left: Values | float,
         rng: np.random.Generator,
     ) -> Change:
-        """What is left of a scan of N points if surfaces return the shares ``left``, (N,)
+        """The change of a scan of N points whose surfaces return the shares ``left``, (N,)
         in [0, 1], of their signals."""
-        nothing = np.zeros(len(scan), np.float32)
-        whole = np.broadcast_to(np.float32(left), len(scan))
-        return self.strongest(scan, distance, whole, nothing, nothing, rng)
+        none = np.zeros(len(scan), np.float32)
+        shares = np.broadcast_to(np.float32(left), len(scan))
+        return self.strongest(scan, distance, shares, none, none, rng)
 
     def strongest(
         self,

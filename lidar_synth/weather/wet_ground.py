@@ -1,9 +1,9 @@
 """Wet ground: a film of water reflects the pulse away from the sensor.
 
 After Hahner et al. 2022 ("LiDAR snowfall simulation for robust 3D object detection"):
-what a dry surface of reflectance p returns at an angle of incidence i passes the surface
-of the water twice, and is lost by Fresnel's reflection and, as the film fills the
-texture, by specular reflection below it. Returns below the sensor's noise floor vanish.
+the pulse passes the surface of the water twice and loses a part by Fresnel reflection
+each time. The more the film fills the texture of the ground, the more is also lost by
+specular reflection. Returns below the sensor's noise floor vanish.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from lidar_synth.weather.signal import SignalLoss, ranges_of
 WATER = 1.33
 """Refractive index."""
 TEXTURE = 1.2
-"""Depth of an asphalt's texture, mm: a deeper film is a mirror."""
+"""Depth of the texture of asphalt, mm; a deeper film is a mirror."""
 CELL = 4.0
 """Side of the squares in which unlabelled ground is found, metres."""
 SIDE = 64
