@@ -78,7 +78,7 @@ BOXED = tuple(
     TRAIN_ID[name]
     for name in ("car", "truck", "other-vehicle", "person", "bicyclist", "motorcyclist")
 )
-"""Train ids of the objects that always have boxes: parked cycles may stand in a scan without."""
+"""Train ids of the classes whose objects always have boxes; parked cycles may have none."""
 
 LABELS = {
     "Car": TRAIN_ID["car"],
@@ -214,7 +214,7 @@ def _others(values: Iterable[Any], allowed: Container[int]) -> list[Any]:
 def _by_name(
     table: Mapping[str, tuple[int, ...]], known: Iterable[int]
 ) -> dict[int, int]:
-    """{id: train id} from {class name: ids}; the ids of ``known`` that no class names are
+    """{id: train id} from {class name: ids}; ids of ``known`` that no class contains are
     ignored."""
     ids = dict.fromkeys(known, IGNORE)
     return ids | {i: TRAIN_ID[name] for name, group in table.items() for i in group}

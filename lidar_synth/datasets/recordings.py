@@ -90,10 +90,10 @@ class Recordings:
 
     def __or__(self, other: "Recordings") -> "Recordings":
         joined = dict(self.drives)
-        for key, frames in other.drives.items():
-            own = joined.get(key, ())
+        for key, theirs in other.drives.items():
+            ours = joined.get(key, ())
             joined[key] = (
-                None if frames is None or own is None else _merged([*own, *frames])
+                None if theirs is None or ours is None else _merged([*ours, *theirs])
             )
         return Recordings(joined)
 
@@ -138,16 +138,14 @@ class Recordings:
         """
         try:
             drives = {
-                (str(p["dataset"]), str(d)): frames
-                for p in values
-                for d, frames in p["drives"].items()
+                (str(part["dataset"]), str(drive)): frames
+                for part in values
+                for drive, frames in part["drives"].items()
             }
-            return cls(
-                {
-                    k: None if v is None else _merged((int(a), int(b)) for a, b in v)
-                    for k, v in drives.items()
-                }
-            )
+            for key, frames in drives.items():
+                if frames is not None:
+                    drives[key] = _merged((int(a), int(b)) for a, b in frames)
+            return cls(drives)
         except (TypeError, KeyError, ValueError, AttributeError) as error:
             raise DataError(
                 f"recordings {str(values)[:200]} ({error!r})",
@@ -171,7 +169,8 @@ def seen_by(provenance: Mapping[str, Any]) -> Recordings:
 
 
 def inherited(provenance: Mapping[str, Any]) -> Recordings:
-    """The recordings behind the checkpoints from which weights were made; raises as ``seen_by``."""
+    """The recordings behind the checkpoints that weights were trained from; raises as
+    ``seen_by``."""
     seen = Recordings()
     for key, value in provenance.items():
         if key.endswith("_provenance") and isinstance(value, Mapping):

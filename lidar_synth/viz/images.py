@@ -48,24 +48,25 @@ def views(given: Sequence[Scan | RangeImage]) -> list[View]:
     """
     if not given:
         raise ConfigError("no scans to show", "at least one scan")
+    result = []
     for item in given:
         if isinstance(item, Scan):
             require_finite(item)
             require_reflectance(item)
         if item.label is not None:
             check_labels(item.label, f"scan {getattr(item, 'id', '')!r}")
-    return [
-        View(item, project(item, channels=[n for n in CHANNELS if n in item.fields()]))
-        if isinstance(item, Scan)
-        else View(unproject(item), item)
-        for item in given
-    ]
+        if isinstance(item, Scan):
+            channels = [name for name in CHANNELS if name in item.fields()]
+            result.append(View(item, project(item, channels=channels)))
+        else:
+            result.append(View(unproject(item), item))
+    return result
 
 
 def _shown(image: RangeImage) -> dict[str, NDArray[Any]]:
-    """The channels that are shown."""
-    has = {"range": image.range, **image.channels}
-    return {name: has[name] for name in CHANNELS if name in has}
+    """{name: values (H, W)} of the channels that are shown."""
+    channels = {"range": image.range, **image.channels}
+    return {name: channels[name] for name in CHANNELS if name in channels}
 
 
 def picture(

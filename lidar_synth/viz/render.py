@@ -131,12 +131,11 @@ def _splat(
     for reach in np.unique(steps):
         chosen = np.flatnonzero(steps == reach)
         span = np.arange(-reach, reach + 1)
-        for dy, dx in (
-            (dy, dx)
-            for dy in span
-            for dx in span
-            if dx * dx + dy * dy <= reach * reach + 0.5
-        ):
+        limit = reach * reach + 0.5
+        disc_offsets = [
+            (dy, dx) for dy in span for dx in span if dx * dx + dy * dy <= limit
+        ]
+        for dy, dx in disc_offsets:
             x = column[chosen] + dx
             y = row[chosen] + dy
             visible = (x >= 0) & (x < width) & (y >= 0) & (y < height)

@@ -29,7 +29,7 @@ def to_rerun(
         title: the name of the recording.
 
     Returns:
-        A ``rerun.RecordingStream`` that holds everything until it is told where to: ``.spawn()``
+        A ``rerun.RecordingStream`` that buffers everything until it has a target: ``.spawn()``
         opens the viewer, ``.save("scans.rrd")`` writes a file.
 
     Raises:
@@ -38,13 +38,13 @@ def to_rerun(
     """
     with needs("rerun", "rerun"):
         import rerun
-    given = [scans] if isinstance(scans, Scan) else list(scans)
-    scales = make_scales(given)
+    several = [scans] if isinstance(scans, Scan) else list(scans)
+    scales = make_scales(several)
     stream = rerun.RecordingStream(title)
     classes = [(n, *pair) for n, pair in enumerate(zip(NAMES, COLOURS, strict=True))]
     stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stream.log("world", rerun.AnnotationContext(classes), static=True)
-    for number, scan in enumerate(given):
+    for number, scan in enumerate(several):
         stream.set_time("scan", sequence=number)
         shown = by or ("range" if scan.label is None else "label")
         values = point_values(scan, shown)
@@ -62,7 +62,7 @@ def to_rerun(
 
 
 def _boxes(rerun: Any, scan: Scan) -> Any:
-    """The boxes of a scan; none clear those of the scan before."""
+    """The boxes of a scan, also if there are none: this clears those of the scan before."""
     values = np.zeros((0, 7)) if scan.boxes is None else scan.boxes.values
     half = values[:, 6:] / 2
     turns = np.column_stack([0 * half, 0 * half, np.sin(half), np.cos(half)])

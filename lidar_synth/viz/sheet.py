@@ -186,7 +186,7 @@ def histograms(
         axes.hist(
             [numbers[~marked], numbers[marked]], bins=60, stacked=True, color=colours
         )
-        # keeps a single scan among thousands visible
+        # A logarithmic scale keeps a single scan among thousands visible.
         axes.set_yscale("symlog", linthresh=1)
         style_axes(
             axes,
@@ -212,7 +212,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def _write_head(figure: Figure, text: str, x: float, y: float) -> None:
-    """Write a heading; names of scans may hold "$", which is no formula."""
+    """Write a heading without formulas, because names of scans may contain "$"."""
     figure.text(x, y, text, color=INK, fontsize=15, va="center", parse_math=False)
 
 
