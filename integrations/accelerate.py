@@ -72,7 +72,7 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
             "Give the loader as it was before accelerator.prepare.",
         )
     divided.divide(accelerator.process_index, accelerator.num_processes)
-    made = prepare_data_loader(
+    prepared = prepare_data_loader(
         loader,
         accelerator.device,
         num_processes=1,
@@ -80,7 +80,7 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
         put_on_device=accelerator.device_placement,
         dispatch_batches=False,
     )
-    shard = _Prepared(made, divided)
+    shard = _Prepared(prepared, divided)
     vars(loader).update(
         state_dict=shard.state_dict, load_state_dict=shard.load_state_dict
     )
@@ -90,17 +90,17 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
 class _Prepared(DataLoaderShard):  # type: ignore[misc]
     """Accelerate's loader, which counts the batches that it has yielded: it fetches one ahead."""
 
-    def __init__(self, made: Any, divided: MixedBatches | MixedStream) -> None:
-        self.__dict__ |= vars(made)
+    def __init__(self, prepared: Any, divided: MixedBatches | MixedStream) -> None:
+        self.__dict__ |= vars(prepared)
         self._divided = divided
         mixed = divided.scans if isinstance(divided, MixedStream) else divided.dataset
         self._current = mixed.current
         self._current.follow(self)
-        self._pass = (0, 0)  # an epoch, and number of its batches done
+        self._pass = (0, 0)  # epoch of the latest pass, and number of its batches done
 
     def begin(self) -> None:
-        """Begin a pass; none of its samples is a repeated one for ``gather_for_metrics`` to
-        drop."""
+        """Begin a pass, of which ``gather_for_metrics`` drops no samples, because none is
+        repeated."""
         super().begin()
         self.remainder = 0
 

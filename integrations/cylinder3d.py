@@ -4,9 +4,10 @@
     LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py \\
         --config_path config/mixed.yaml
 
-with ``pc_dataset_type: "SemKITTI_mixed"`` in that configuration. Cylinder3D rotates points in
-place, so that every sample is a copy. It does not call ``set_epoch``, so that the launcher replaces
-its loader by one that does. It counts epochs from 0 also when it starts from saved weights.
+with ``pc_dataset_type: "SemKITTI_mixed"`` in that configuration. Every sample is a copy, because
+Cylinder3D rotates points in place. The launcher replaces its loader by one that calls
+``set_epoch``, which Cylinder3D does not. It counts epochs from 0 even when it starts from saved
+weights.
 """
 
 from functools import cache

@@ -151,10 +151,10 @@ def write_gt_database(
 ) -> Path:
     """Write a bank of objects as the database of a trainer's GT sampling.
 
-    Points are relative to the trainer's reference point of the box. Both trainers read the list of
-    objects as a pickle, so that the package writes one; it never reads one. They leave out objects
-    of difficulty -1, so an unknown occlusion counts as none, and nuScenes' objects have difficulty
-    0, as MMDetection3D gives them.
+    Points are relative to the trainer's reference point of the box. The list of objects is a
+    pickle, because both trainers read one; the package itself never reads pickles. Trainers leave
+    out objects of difficulty -1. Unknown occlusion therefore counts as none, and nuScenes' objects
+    have difficulty 0, as in MMDetection3D's own database.
 
     Args:
         objects: of any source with boxes, ``ObjectBank.from_scans(source)``.
@@ -174,7 +174,7 @@ def write_gt_database(
         FileError: if it cannot be written.
     """
     root = Path(root)
-    found = dict[str, list[dict[str, Any]]]()
+    listed = dict[str, list[dict[str, Any]]]()
     names: Sequence[str | None] = objects.boxes.names
     if layout == "nuscenes":
         names = nuscenes_names(objects.boxes.names, "the bank of objects")
@@ -202,8 +202,8 @@ def write_gt_database(
             "score": -1.0,
             "bbox": objects.boxes.image_box[i],
         }
-        found.setdefault(name, []).append(facts)
-    write_file(root / infos, pickle.dumps(found))
+        listed.setdefault(name, []).append(facts)
+    write_file(root / infos, pickle.dumps(listed))
     return root / infos
 
 

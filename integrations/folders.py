@@ -26,7 +26,7 @@ from lidar_synth.geometry import Scan, Source, scan_hash
 from lidar_synth.mixing import MixedScans
 
 COMPARED = 3
-"""Synthetic samples by which an export that is resumed is compared with the one that began."""
+"""Number of synthetic samples by which a resumed export is compared with the one it continues."""
 MANIFEST = "mixture.csv"
 SETTINGS = ".mixture.json"
 
@@ -70,7 +70,7 @@ def export_mixture(
     root = Path(out)
     count = len(mixed)
     camera = calibration or OBJECT_CAMERA
-    held = [] if validation is None else validation
+    held_out = [] if validation is None else validation
     claim(
         root / SETTINGS,
         {
@@ -80,7 +80,7 @@ def export_mixture(
             "projection": camera.projection.tolist(),
             "camera_from_sensor": camera.camera_from_sensor.tolist(),
             "image": camera.image_size,
-            **({} if validation is None else {"validation": len(held)}),
+            **({} if validation is None else {"validation": len(held_out)}),
         },
     )
     kitti = layout == "kitti"
@@ -94,14 +94,14 @@ def export_mixture(
     first = count if kitti else 0
     others = writer if kitti else SemanticKITTIWriter(root, sequence="08")
     for number in tqdm(
-        range(len(held)), "validation", unit="scan", disable=not progress
+        range(len(held_out)), "validation", unit="scan", disable=not progress
     ):
-        scan = replace(held[number], id=f"validation {number}")
+        scan = replace(held_out[number], id=f"validation {number}")
         written += _write(others, scan, first + number, camera)
     writer.finish()
     if kitti and validation is not None:
         _write_split(root, "train", range(count))
-        _write_split(root, "val", range(count, count + len(held)))
+        _write_split(root, "val", range(count, count + len(held_out)))
     write_file(root / MANIFEST, "".join(f"{row}\n" for row in rows).encode())
     return written
 
@@ -113,8 +113,8 @@ def _write_split(root: Path, split: str, frames: range) -> None:
 
 
 def _write(writer: Writer, scan: Scan, number: int, camera: Calibration) -> int:
-    """Write a scan with all that the layout needs; returns how many were written, 0 if it is
-    complete."""
+    """Write a scan with all files of the layout; returns the number of scans written, 0 if it
+    exists."""
     if writer.complete(number):
         return 0
     kitti = isinstance(writer, KITTIObjectWriter)
@@ -142,8 +142,8 @@ def _sample(mixed: MixedScans, epoch: int, position: int) -> Scan:
 
 
 def _first_synthetic(mixed: MixedScans, epoch: int) -> list[str]:
-    """Hashes of the first synthetic samples: they tell label policies and augmentations, which the
-    plan leaves out."""
+    """Hashes of the first synthetic samples, which depend on the label policy and the augmentation;
+    the plan does not."""
     first = np.flatnonzero(mixed.plan(epoch).domain)[:COMPARED].tolist()
     return [scan_hash(_sample(mixed, epoch, position)) for position in first]
 

@@ -1,8 +1,8 @@
 """Shared by the launchers: the script on the command line, and a trial of a trainer on a machine
 without a GPU.
 
-Without a GPU, or with ``LIDAR_SYNTH_CPU=1``, what a trainer sends to a GPU stays on the CPU. That
-shows whether a configuration runs; no one trains so.
+Without a GPU, or with ``LIDAR_SYNTH_CPU=1``, what a trainer sends to a GPU stays on the CPU. This
+shows whether a configuration runs; it is too slow for training.
 """
 
 import logging
@@ -70,7 +70,7 @@ def run(script: str) -> None:
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """End with the message alone, and exit status 1, where this package refuses a configuration."""
+    """On an error of this package, exit with status 1 and its message instead of a traceback."""
     try:
         yield
     except LidarSynthError as error:
@@ -87,13 +87,13 @@ def stay_on_cpu() -> None:
     changed: dict[tuple[Any, str], Any] = {
         (torch.cuda, "set_device"): lambda device: None,
         (torch.Tensor, "get_device"): lambda self: self.device,
-        (torch, "load"): _mapped(torch.load),
-        (torch, "eye"): _made(torch.eye),
+        (torch, "load"): _loading_to_cpu(torch.load),
+        (torch, "eye"): _on_default_device(torch.eye),
         (functional, "nll_loss"): _int64(functional.nll_loss),
     }
     for kind in (torch.Tensor, torch.nn.Module):
         changed[kind, "cuda"] = lambda self, *args, **options: self
-        changed[kind, "to"] = _kept(kind.to)
+        changed[kind, "to"] = _without_gpu(kind.to)
     for (owner, name), new in changed.items():
         setattr(owner, name, new)
     if "spconv.pytorch" in sys.modules:
@@ -108,6 +108,8 @@ def _on_gpu(device: Any) -> bool:
 
 
 def _int64(loss: Any) -> Any:
+    """A loss that takes class targets of any integer type."""
+
     @wraps(loss)
     def changed(values: Any, target: Any, *args: Any, **options: Any) -> Any:
         return loss(values, target.long(), *args, **options)
@@ -116,8 +118,8 @@ def _int64(loss: Any) -> Any:
 
 
 def _bias_after(forward: Any) -> Any:
-    """spconv adds a bias after the convolution in training, and within it, which needs a GPU, in
-    evaluation."""
+    """spconv's forward in training mode, which adds the bias after the convolution; in evaluation
+    mode it does so within it, which needs a GPU."""
 
     @wraps(forward)
     def changed(self: Any, training: bool, *args: Any, **options: Any) -> Any:
@@ -126,7 +128,9 @@ def _bias_after(forward: Any) -> Any:
     return changed
 
 
-def _kept(move: Any) -> Any:
+def _without_gpu(move: Any) -> Any:
+    """The method ``to`` that leaves out a GPU."""
+
     @wraps(move)
     def moved(self: Any, *args: Any, **options: Any) -> Any:
         left = [value for value in args if not _on_gpu(value)]
@@ -138,18 +142,20 @@ def _kept(move: Any) -> Any:
     return moved
 
 
-def _made(make: Any) -> Any:
+def _on_default_device(make: Any) -> Any:
+    """A function that makes a tensor, without a GPU as its device."""
+
     @wraps(make)
-    def made(*args: Any, **options: Any) -> Any:
-        return make(
-            *args,
-            **{key: value for key, value in options.items() if not _on_gpu(value)},
-        )
+    def changed(*args: Any, **options: Any) -> Any:
+        kept = {key: value for key, value in options.items() if not _on_gpu(value)}
+        return make(*args, **kept)
 
-    return made
+    return changed
 
 
-def _mapped(load: Any) -> Any:
+def _loading_to_cpu(load: Any) -> Any:
+    """``torch.load`` that maps a GPU to the CPU."""
+
     @wraps(load)
     def loaded(*args: Any, **options: Any) -> Any:
         if _on_gpu(options.get("map_location")):

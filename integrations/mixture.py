@@ -56,27 +56,27 @@ def take_classes(settings: dict[str, Any]) -> Taxonomy:
     Raises:
         ConfigError: on another name, class or id.
     """
-    given = settings.pop("classes", "semantic_kitti")
-    if not isinstance(given, Mapping):
-        if not isinstance(given, str) or given not in FILE_CLASSES:
+    classes = settings.pop("classes", "semantic_kitti")
+    if not isinstance(classes, Mapping):
+        if not isinstance(classes, str) or classes not in FILE_CLASSES:
             raise ConfigError(
-                f"classes: {given}",
+                f"classes: {classes}",
                 f"one of {', '.join(FILE_CLASSES)}, or {{class name: id}}",
             )
-        return FILE_CLASSES[given]
+        return FILE_CLASSES[classes]
     wrong = {
-        n: i
-        for n, i in given.items()
-        if n not in TRAIN_ID or type(i) is not int or not 0 < i < 1 << 16
+        name: number
+        for name, number in classes.items()
+        if name not in TRAIN_ID or type(number) is not int or not 0 < number < 1 << 16
     }
-    if wrong or not given:
+    if wrong or not classes:
         raise ConfigError(
             f"classes: {wrong}", f"ids from 1 to 65535 by some of {', '.join(NAMES)}"
         )
     return Taxonomy(
         "classes",
-        {0: IGNORE} | {i: TRAIN_ID[n] for n, i in given.items()},
-        tuple(given.get(n, 0) for n in NAMES),
+        {0: IGNORE} | {number: TRAIN_ID[name] for name, number in classes.items()},
+        tuple(classes.get(name, 0) for name in NAMES),
     )
 
 
@@ -84,7 +84,7 @@ def synthetic_epoch(mixed: MixedScans, epoch: int = 0) -> int | None:
     """The nearest epoch with synthetic samples: this one, or the latest before it, or the next one
     after it; None if no epoch has any.
 
-    Of a schedule that never settles the first hundred epochs count.
+    Of a schedule that never becomes constant, only the first hundred epochs are searched.
     """
     last = constant_from(mixed.mixture.ratio)
     later = range(epoch + 1, 1 + (100 if last is None else last))
@@ -93,7 +93,7 @@ def synthetic_epoch(mixed: MixedScans, epoch: int = 0) -> int | None:
 
 
 def first_synthetic(mixed: MixedScans, count: int) -> Iterator[Any]:
-    """Up to ``count`` synthetic samples of the first epoch that has some, for checks before a
+    """Up to ``count`` synthetic samples of the first epoch that has some, for checks before
     training."""
     if (epoch := synthetic_epoch(mixed)) is not None:
         for position in np.flatnonzero(mixed.plan(epoch).domain)[:count].tolist():
@@ -107,11 +107,11 @@ def trainer_ids(
 
     Args:
         learning_map: the trainer's id by the file's class.
-        taxonomy: of the files, see ``take_classes``.
-        table: (256,) what SemanticKITTI's classes must get, see ``id_table``.
+        taxonomy: the classes of the files, see ``take_classes``.
+        table: (256,) the ids that SemanticKITTI's classes must have, see ``id_table``.
 
     Raises:
-        ConfigError: if the map has not the file's classes, or gives SemanticKITTI's other ids.
+        ConfigError: if the map lacks a class of the files, or gives other ids to SemanticKITTI's.
     """
     if taxonomy is SEMANTIC_KITTI:
         require_ids(learning_map, table)
@@ -234,7 +234,7 @@ def inner(
 
 
 class MixedEpoch:
-    """What a trainer's dataset that is mixed has; combine it with that dataset.
+    """A mixin that makes a trainer's dataset serve a mixture.
 
     Attributes:
         mixed: the mixture; None where the dataset has real scans only.

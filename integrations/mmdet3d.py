@@ -90,8 +90,8 @@ class SynthBackend(BaseStorageBackend):  # type: ignore[misc]
 
 
 class SynthBoxes:
-    """What a ``Det3DDataset`` for a mixed list adds: a synthetic entry has the boxes of its scan in
-    this epoch.
+    """A mixin for a ``Det3DDataset`` of a mixed list: a synthetic entry has the boxes of its scan
+    in this epoch.
 
     Args:
         options: as for the dataset. ``filter_empty_gt`` must be False: replacing scans without
@@ -129,11 +129,13 @@ class SynthBoxes:
         return info
 
     def _annotations(self, scan: Scan) -> dict[str, Any]:
+        """The boxes of a synthetic scan as the trainer's annotations; unused classes are left
+        out."""
         known = self.METAINFO["classes"]  # type: ignore[attr-defined]
-        given = require_boxes(scan, known)
+        required = require_boxes(scan, known)
         mapping = self.label_mapping  # type: ignore[attr-defined]
-        labels = np.array([mapping[known.index(n)] for n in given.names], np.int64)
-        values = given.values
+        labels = np.array([mapping[known.index(n)] for n in required.names], np.int64)
+        values = required.values
         # nothing moves in the sweeps of a synthetic scan
         if getattr(self, "with_velocity", False):
             values = np.column_stack([values, np.zeros((len(values), 2), np.float32)])
@@ -207,8 +209,8 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
                 "the list's own dataset, not repeated or joined with others",
                 "Of a RepeatDataset: times=1.",
             )
-        [own] = [each for each in inner(dataset) if hasattr(each, "ann_file")]
-        own.pipeline.transforms.insert(0, partial(draw_in_epoch, self.planned.path))
+        [mixed] = [each for each in inner(dataset) if hasattr(each, "ann_file")]
+        mixed.pipeline.transforms.insert(0, partial(draw_in_epoch, self.planned.path))
         length = len(self.planned.mixed)
         self.num_samples = math.ceil(
             (length - (0 if self.round_up else self.rank)) / self.world_size
@@ -305,15 +307,15 @@ def _checked(dataset: Any) -> list[SlotFolder]:
     Raises:
         ConfigError: see ``SynthSampler``.
     """
-    held = [
+    lists = [
         each
         for each in inner(dataset)
         if isinstance(getattr(each, "ann_file", None), str)
     ]
-    mixed = [each for each in held if is_mixed(Path(each.ann_file).resolve().parent)]
+    mixed = [each for each in lists if is_mixed(Path(each.ann_file).resolve().parent)]
     if not mixed:
         raise ConfigError(
-            f"SynthSampler with {[each.ann_file for each in held]}",
+            f"SynthSampler with {[each.ann_file for each in lists]}",
             "a mixed list, an ann_file that write_infos wrote",
         )
     for each in mixed:

@@ -80,8 +80,8 @@ def write_infos(
             below 1.
     """
     out = Path(out).resolve()
-    given = _read(real)
-    entries = given["data_list"]
+    original = _read(real)
+    entries = original["data_list"]
     detects = "instances" in entries[0]
     if not detects:
         refuse_unlabelled(settings, "MMDetection3D's segmentation")
@@ -97,14 +97,14 @@ def write_infos(
         "format": FORMAT,
         "real": len(entries),
         "settings": _stored(settings),
-        "layout": _layout(given, entries[0], layout, real),
+        "layout": _layout(original, entries[0], layout, real),
         "view": None if view is False else camera,
     }
     folder = SlotFolder(out, facts)
     facts["plan"] = folder.mixed.plan(0).hash
     entries = entries + _slots(out, folder, entries, detects)
     write_file(out / MIXTURE, json.dumps(facts, indent=1).encode())
-    listed = {"metainfo": given.get("metainfo", {}), "data_list": entries}
+    listed = {"metainfo": original.get("metainfo", {}), "data_list": entries}
     write_file(out / INFOS, json.dumps(listed, default=_plain).encode())
     open_folder.cache_clear()  # this process may have opened an earlier list in this folder
     return out / INFOS
@@ -113,19 +113,19 @@ def write_infos(
 def _read(real: str | Path) -> Any:
     """The trainer's list, with at least one entry."""
     if Path(real).suffix == ".json":
-        given = parse_json(
+        content = parse_json(
             read_text(Path(real)), str(real), "an info list of MMDetection3D"
         )
     else:
         # reads the trainer's own pickle, as the trainer does
         from mmengine.fileio import load
 
-        given = load(str(real))
-    if not isinstance(given, dict) or not given.get("data_list"):
+        content = load(str(real))
+    if not isinstance(content, dict) or not content.get("data_list"):
         raise DataError(
             f"{real} has no 'data_list'", "an info list of MMDetection3D 1.1 or later"
         )
-    return given
+    return content
 
 
 def _stored(settings: dict[str, Any]) -> dict[str, Any]:
@@ -153,30 +153,31 @@ def _absolute(value: Any, name: Any = None) -> Any:
         return {key: _absolute(each, key) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [_absolute(each, name) for each in value]
-    path = isinstance(value, Path) or (
+    is_path = isinstance(value, Path) or (
         isinstance(value, str)
         and str(name).lower() in PATHS
         and (name, value) != ("bank", "town")  # shipped with the package
         and (name == "cache" or Path(value).exists())
     )
-    return str(Path(value).resolve()) if path else value
+    return str(Path(value).resolve()) if is_path else value
 
 
 def _layout(
-    given: dict[str, Any], entry: Entry, layout: str | None, real: str | Path
+    content: dict[str, Any], entry: Entry, layout: str | None, real: str | Path
 ) -> str:
-    """The layout of a list: the one that is given, or nuScenes' if the list says so, or KITTI's."""
-    dataset = str(given.get("metainfo", {}).get("dataset", "")).lower()
+    """The layout of a list: ``layout``, or by default nuScenes' if the list says so, else
+    KITTI's."""
+    dataset = str(content.get("metainfo", {}).get("dataset", "")).lower()
     name = layout or ("nuscenes" if dataset == "nuscenes" else "kitti")
     if name not in LAYOUTS:
         raise ConfigError(f"layout={name!r}", f"one of {', '.join(LAYOUTS)}")
-    found = entry["lidar_points"].get("num_pts_feats", LAYOUTS[name].features)
-    if found != LAYOUTS[name].features:
+    features = entry["lidar_points"].get("num_pts_feats", LAYOUTS[name].features)
+    if features != LAYOUTS[name].features:
         fits = ", ".join(
             f"{each!r} ({known.features})" for each, known in LAYOUTS.items()
         )
         raise ConfigError(
-            f"{real}: points of {found} values for layout={name!r}",
+            f"{real}: points of {features} values for layout={name!r}",
             f"another layout: {fits}",
         )
     return name
@@ -250,10 +251,9 @@ def _make_absolute(entry: Entry, root: Path, points: str, sweeps: str) -> None:
     if "pts_semantic_mask_path" in entry:
         entry["pts_semantic_mask_path"] = str(root / entry["pts_semantic_mask_path"])
     for sweep in entry.get("lidar_sweeps", ()):  # the trainer takes the name only, too
-        given = Path(sweep["lidar_points"]["lidar_path"])
-        sweep["lidar_points"]["lidar_path"] = str(
-            root / (points if "samples" in str(given) else sweeps) / given.name
-        )
+        path = Path(sweep["lidar_points"]["lidar_path"])
+        folder = points if "samples" in str(path) else sweeps
+        sweep["lidar_points"]["lidar_path"] = str(root / folder / path.name)
 
 
 def _check_files(entry: Entry) -> None:
@@ -275,7 +275,7 @@ def _balanced(entries: list[Entry], seed: int) -> list[Entry]:
     """Entries drawn so that each class is in about the same number of them (Zhu et al. 2019,
     arXiv:1908.09492).
 
-    A class that few entries have is drawn more often; classes that no entry has do not count.
+    Entries of a rare class are drawn more often; classes without entries are left out.
     """
     by_class: dict[int, list[int]] = {}
     for number, entry in enumerate(entries):

@@ -204,7 +204,7 @@ def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, 
     floor, size, turn = boxes_to_camera(boxes.values, camera)
     counts = boxes.contain(seen.points).sum(1)
     levels = difficulty(boxes)
-    found = []
+    instances = []
     for i, name in enumerate(boxes.names):
         label = CLASSES.index(name) if name in CLASSES else OTHER
         # Place, length, height, width, turn.
@@ -225,13 +225,13 @@ def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, 
             "occluded": boxes.occlusion[i],
             "alpha": boxes.alpha[i],
         }
-        found.append(
+        instances.append(
             {k: np.asarray(v).tolist() for k, v in facts.items()}
             | {"score": 0.0, "index": i, "group_id": i}
         )
     for rectangle in boxes.dont_care.tolist():
-        found.append(DONT_CARE | {"bbox": rectangle, "group_id": len(found)})
-    return found
+        instances.append(DONT_CARE | {"bbox": rectangle, "group_id": len(instances)})
+    return instances
 
 
 def write_list(

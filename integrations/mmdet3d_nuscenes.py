@@ -97,13 +97,13 @@ def _entry(tables: Any, sample: dict[str, Any], sweeps: int) -> dict[str, Any]:
         "timestamp": frame["timestamp"] / 1e6,
         "ego2global": in_world.tolist(),
     }
-    found: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     earlier = frame
-    while earlier["prev"] and len(found) < sweeps:
+    while earlier["prev"] and len(entries) < sweeps:
         earlier = tables.get("sample_data", earlier["prev"])
-        found.append(_sweep(tables, earlier, in_world @ in_ego))
-    if found:  # without the key, the trainer repeats the key frame
-        entry["lidar_sweeps"] = found
+        entries.append(_sweep(tables, earlier, in_world @ in_ego))
+    if entries:  # without the key, the trainer repeats the key frame
+        entry["lidar_sweeps"] = entries
     return entry | {"lidar_points": points, "instances": _instances(tables, frame)}
 
 
@@ -123,7 +123,7 @@ def _instances(tables: Any, frame: dict[str, Any]) -> list[dict[str, Any]]:
     _, boxes, _ = tables.get_sample_data(frame["token"])
     in_ego, in_world = _poses(tables, frame)
     turn = np.linalg.inv((in_world @ in_ego)[:3, :3])
-    found = []
+    instances = []
     for box in boxes:
         name = category_to_detection_name(box.name)
         row = tables.get("sample_annotation", box.token)
@@ -148,12 +148,12 @@ def _instances(tables: Any, frame: dict[str, Any]) -> list[dict[str, Any]]:
             "num_radar_pts": row["num_radar_pts"],
         }
         valid = sum(counts.values()) > 0
-        found.append(
+        instances.append(
             instance
             | counts
             | {"bbox_3d_isvalid": valid, "bbox_label": label, "bbox_label_3d": label}
         )
-    return found
+    return instances
 
 
 def _poses(

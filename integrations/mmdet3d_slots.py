@@ -87,8 +87,8 @@ class SlotFolder:
         self.real = int(facts["real"])
         self.layout = LAYOUTS[facts["layout"]]
         self.mixed = mix_for_trainer(self.real, self.settings, weighs=True)
-        some = synthetic_epoch(self.mixed) is not None
-        self.slots = self.mixed.mixture.laps[0] if some else 0
+        mixes = synthetic_epoch(self.mixed) is not None
+        self.slots = self.mixed.mixture.laps[0] if mixes else 0
         self._view = (
             None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
         )
@@ -126,8 +126,8 @@ class SlotFolder:
         """The epoch of the samples that this process reads; 0 until it is set.
 
         Raises:
-            ConfigError: in a worker process that was never told the epoch: every epoch would have
-                the same scans.
+            ConfigError: in a worker process where it was never set: every epoch would have the same
+                scans.
         """
         if self._epoch is None and get_worker_info() is not None:
             raise ConfigError(
@@ -178,16 +178,15 @@ class SlotFolder:
 
     def _position(self, epoch: int, slot: int) -> tuple[int, int]:
         """Epoch and position of a slot: in the nearest epoch that has synthetic scans."""
-        found = synthetic_epoch(self.mixed, epoch)
-        if found is None or not 0 <= slot < self.slots:
+        nearest = synthetic_epoch(self.mixed, epoch)
+        if nearest is None or not 0 <= slot < self.slots:
             raise DataError(f"slot {slot} of {self.path}", f"one of its {self.slots}")
-        epoch = found
-        positions = np.flatnonzero(self.entries(epoch) >= self.real)
-        return epoch, int(positions[slot % len(positions)])
+        positions = np.flatnonzero(self.entries(nearest) >= self.real)
+        return nearest, int(positions[slot % len(positions)])
 
 
 def _by_epoch(value: Any) -> Any:
-    """A setting by epoch with numbers for its epochs: JSON knows names only."""
+    """A setting by epoch, with its epochs as numbers, which JSON stores as text."""
     if not isinstance(value, dict):
         return value
     return {int(k) if str(k).isdigit() else k: v for k, v in value.items()}

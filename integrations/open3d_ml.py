@@ -7,8 +7,8 @@
     )
     pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, ...)
 
-Its cache identifies samples by name and would keep the synthetic scans of one epoch for ever:
-    ``use_cache`` is refused.
+``use_cache`` is refused: the cache identifies samples by name, and would keep the synthetic scans
+of one epoch forever.
 """
 
 import sys
@@ -152,7 +152,7 @@ def _library() -> Any:
     """``open3d.ml.torch``, or an error that says which of its parts is missing."""
     try:
         ml3d = import_module("open3d.ml.torch")
-        # They are imported when first used.
+        # Accessed here, because they are imported only when they are first used.
         return SimpleNamespace(datasets=ml3d.datasets, pipelines=ml3d.pipelines)
     except (ImportError, OSError, RuntimeError) as error:
         if isinstance(error, ImportError):

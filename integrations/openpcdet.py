@@ -97,7 +97,7 @@ def tell_epochs() -> None:
             batches.sampler = Rest(
                 batches.sampler if several else SequentialSampler(train_loader.dataset)
             )
-            # Nothing for the iterator that OpenPCDet makes and drops.
+            # No samples for the iterator that OpenPCDet makes first and does not use.
             batches.sampler.skipped = len(batches.sampler)
             if train_loader.dataset.weighed:
                 weigh_openpcdet(model)

@@ -71,7 +71,7 @@ class MixedDetection(MixedEpoch):
         )
 
     def __len__(self) -> int:
-        # While OpenPCDet's own code works, it counts real scans.
+        # OpenPCDet's own code, which runs while a sample is made, expects the number of real scans.
         if self.mixed is None or self._current is not None:
             return int(super(MixedEpoch, self).__len__())  # type: ignore[misc]
         return len(self.mixed)
@@ -83,10 +83,10 @@ class MixedDetection(MixedEpoch):
             return self._replacement(index)
         self._current = index % len(self.mixed)
         try:
-            made = self._take(self._current, super().__getitem__)  # type: ignore[misc]
+            sample = self._take(self._current, super().__getitem__)  # type: ignore[misc]
             if self.weighed:
-                made[KEY] = np.float32(self.mixed.loss_weight(self._current))
-            return made
+                sample[KEY] = np.float32(self.mixed.loss_weight(self._current))
+            return sample
         finally:
             self._current = None
 

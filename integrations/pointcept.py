@@ -132,8 +132,8 @@ class EpochOf:
     read when it is needed.
 
     Args:
-        loader: any loader of Pointcept; whatever else is asked of it is passed on.
-        trainer: its ``epoch`` counts.
+        loader: any loader of Pointcept; its other attributes stay accessible.
+        trainer: the trainer, whose ``epoch`` is read.
     """
 
     def __init__(self, loader: Any, trainer: Any) -> None:

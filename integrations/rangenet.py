@@ -50,8 +50,8 @@ TRAINERS = {
 """{module of the trainer: module from which it imports its parser, or None where it loads the
 parser by its path}."""
 STRIPES = 0.25
-"""Largest difference of ``gaps`` between real and synthetic images; below, the eye sees images of
-one density."""
+"""Largest difference of ``gaps`` between real and synthetic images; below it, both look equally
+dense."""
 
 _MEMORY = next((str(folder) for folder in (Path("/dev/shm"),) if folder.is_dir()), None)
 
@@ -147,24 +147,24 @@ def check_stripes(dataset: Any) -> None:
         return
 
     def measure(width: int) -> list[tuple[float, float]]:
-        kinds = [
-            [dataset.image(source, width) for source in sources]
-            for sources in (real, synthetic)
-        ]
-        return [
-            (float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)])))
-            for k in kinds
-        ]
+        """Mean shares of filled cells and of gaps: of real images, then of synthetic ones."""
+        shares = []
+        for sources in (real, synthetic):
+            images = [dataset.image(source, width) for source in sources]
+            fill = float(np.mean([*map(filled, images)]))
+            shares.append((fill, float(np.mean([*map(gaps, images)]))))
+        return shares
 
-    (real_fill, real_gaps), (fill, holes) = measure(width := dataset.sensor_img_W)
+    width = dataset.sensor_img_W
+    (real_fill, real_gaps), (fill, holes) = measure(width)
     if holes - real_gaps <= STRIPES:
         return
-    narrower = [
-        w
-        for w in (width // 2, width // 4, width // 8)
-        if (m := measure(w))[1][1] - m[0][1] <= STRIPES
-    ]
-    fitting = narrower[0] if narrower else "the columns of the synthetic scans"
+    fitting = "the columns of the synthetic scans"
+    for narrower in (width // 2, width // 4, width // 8):
+        (_, real_share), (_, share) = measure(narrower)
+        if share - real_share <= STRIPES:
+            fitting = str(narrower)
+            break
     raise ConfigError(
         f"synthetic scans in images of {dataset.sensor_img_H} x {width}: {fill:.0%} of the cells "
         f"are filled, and {holes:.0%} of these have an empty cell to the right; in real scans "
@@ -204,10 +204,10 @@ def make_parser(stock: Any, settings: Any = None) -> Any:
         def __init__(self, *args: Any, **options: Any) -> None:
             super().__init__(*args, **options)
             self.trainiter = None  # its workers would read the stock training set
-            own = self.train_dataset
+            unmixed = self.train_dataset
             loader = self.trainloader
             arguments = {
-                name: getattr(own, name)
+                name: getattr(unmixed, name)
                 for name in (
                     "labels",
                     "color_map",
@@ -218,8 +218,8 @@ def make_parser(stock: Any, settings: Any = None) -> Any:
                     "gt",
                 )
             }
-            if hasattr(own, "transform"):  # SalsaNext's
-                arguments["transform"] = own.transform
+            if hasattr(unmixed, "transform"):  # SalsaNext's
+                arguments["transform"] = unmixed.transform
             self.train_dataset = dataset_class(stock)(
                 settings, self.root, self.train_sequences, **arguments
             )
@@ -263,8 +263,8 @@ def register() -> None:
 
     if parser:
         # A class of this name beside the trainer's own would end up in its super(Parser, self).
-        made = SimpleNamespace(Parser=make_parser(parser))
-        sys.modules[parser.__name__] = made  # type: ignore[assignment]
+        replacement = SimpleNamespace(Parser=make_parser(parser))
+        sys.modules[parser.__name__] = replacement  # type: ignore[assignment]
     else:
         module.imp = _loader(module.imp.load_source)
     module.Trainer.train_epoch = train_epoch
@@ -300,8 +300,8 @@ def _loader(load: Any) -> SimpleNamespace:
 
 
 def _plain_state(scheduler: Any) -> None:
-    """Checkpoints hold numbers of the inner scheduler, not the object, which ``torch.load`` refuses
-    since 2.6."""
+    """Make checkpoints hold the state of the inner scheduler instead of the object, which
+    ``torch.load`` refuses since 2.6."""
     state_dict = scheduler.state_dict
     load_state_dict = scheduler.load_state_dict
 

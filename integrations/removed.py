@@ -31,13 +31,13 @@ def provide(*names: str) -> list[str]:
     Raises:
         LibraryError: if a library that replaces a removed one is not installed.
     """
-    made = [name for name in names if NAMES[name][1]()]
-    if made:
+    provided = [name for name in names if NAMES[name][1]()]
+    if provided:
         print(
-            f"lidar_synth: provides {', '.join(f'{name} ({NAMES[name][0]})' for name in made)}",
+            f"lidar_synth: provides {', '.join(f'{name} ({NAMES[name][0]})' for name in provided)}",
             flush=True,
         )
-    return made
+    return provided
 
 
 def _numpy(name: str, kind: type) -> bool:
@@ -74,8 +74,8 @@ def _imp() -> bool:
 def _tensorflow() -> bool:
     """TensorFlow 1's summaries, written by TensorBoard: the same messages in the same kind of
     file."""
-    there = "tensorflow" in sys.modules or find_spec("tensorflow")
-    if there and hasattr(import_module("tensorflow").summary, "FileWriter"):
+    installed = "tensorflow" in sys.modules or find_spec("tensorflow")
+    if installed and hasattr(import_module("tensorflow").summary, "FileWriter"):
         return False
     try:
         tensorboard = import_module("tensorboard.compat")
@@ -87,7 +87,7 @@ def _tensorflow() -> bool:
             "tensorboard, for logs",
             "pip install tensorboard",
         ) from error
-    # TensorBoard looks for TensorFlow once, when this is first used: before there is ours.
+    # TensorBoard looks for TensorFlow once, when this is first used: here, before ours is set.
     assert tensorboard.tf.io
     summary = _module("tensorflow.summary", FileWriter=writer.FileWriter)
     _module(

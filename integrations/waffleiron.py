@@ -147,8 +147,8 @@ def register() -> Any:
 def main() -> None:
     """Run WaffleIron's training script with the dataset registered.
 
-    The script is imported, not run as a file: so the processes of ``--multiprocessing-distributed``
-    import this module, and register the dataset as well.
+    The script is imported, not run as a file, so that the processes of
+    ``--multiprocessing-distributed`` import this module and register the dataset as well.
     """
     script = prepare_script(USAGE, "torch.load")
     with plain_errors():

@@ -34,10 +34,10 @@ class WeighedLoss(nn.Module):
 
     def forward(self, *args: Any, **options: Any) -> Tensor:
         """The loss (B, ...), multiplied."""
-        found: Tensor = self.loss(*args, **options)
+        loss: Tensor = self.loss(*args, **options)
         if self.weights is None:
-            return found
-        return found * self.weights.view(-1, *[1] * (found.dim() - 1)).to(found)
+            return loss
+        return loss * self.weights.view(-1, *[1] * (loss.dim() - 1)).to(loss)
 
 
 def weigh_openpcdet(model: Any) -> None:
