@@ -152,7 +152,7 @@ def write_gt_database(
     """Write a bank of objects as the database of a trainer's GT sampling.
 
     Points are relative to the trainer's reference point of the box. The list of objects is a
-    pickle, because both trainers read one; the package itself never reads pickles. Trainers leave
+    pickle, because both trainers read one; the package only writes it. Trainers leave
     out objects of difficulty -1. Unknown occlusion therefore counts as none, and nuScenes' objects
     have difficulty 0, as in MMDetection3D's own database.
 
