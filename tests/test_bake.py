@@ -430,6 +430,7 @@ def test_every_setting_is_an_option_with_its_description_and_default(
     ("change", "message"),
     [
         ({"seed": 5}, r"'seed': 4.*'seed': 5"),
+        ({"seed": 5, "count": 16}, r"or choose another folder\.$"),
         (
             {"count": 16},
             r"'count': 10.*'count': 16.*--first 10 --count 6, then .*merge",
@@ -538,6 +539,7 @@ def test_shards_of_small_banks_are_small(
             "--shard-index 3 of --num-shards 3",
         ),
         (["--shard-index", "auto"], "--shard-index auto outside an array job"),
+        (["--shard-index", ""], "--shard-index '' of --num-shards '1'"),
         (["--shard-index", "two"], "--shard-index 'two' of --num-shards '1'"),
         (["--slurm", "partition"], "--slurm 'partition'; expected KEY=VALUE"),
         (["--model", "city"], "model 'city'; expected a shipped one"),

@@ -68,8 +68,12 @@ def test_options_that_would_be_ignored_are_refused(
 
 
 def test_workers_without_a_shard_are_reported(model: Path, tmp_path: Path) -> None:
-    options = "--count 20 --shard-size 10 --workers 7 --dry-run"
+    options = "--count 9 --shard-size 9 --workers 4 --dry-run"
     assert run(model, tmp_path, options).output.startswith(
-        "2 shards for 7 workers: --shard-size 3 uses all\n"
+        "1 shard for 4 workers: --shard-size 2 of a new bank uses all\n"
     )
+    assert (
+        "for 4 workers" not in run(model, tmp_path, f"{options} --shard-size 2").output
+    )
+    assert "uses all" not in run(model, tmp_path, f"{options} --count 3").output
     assert "uses all" not in run(model, tmp_path, "--dry-run").output

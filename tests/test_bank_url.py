@@ -24,6 +24,7 @@ from lidar_synth.bank.storage import LocalFile, RangedFile, RemoteFile
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.lab.train.cache import ImageCache, cache_scans
 
 pytest.importorskip("aiohttp")  # of the extra `remote`, which `dev` has
 
@@ -97,6 +98,23 @@ def test_a_url_gives_the_same_scans_as_the_folder(
             and np.array_equal(a.points, b.points)
             and np.array_equal(a.label, b.label)
         )
+
+
+def test_a_training_keeps_the_scans_of_a_bank_at_a_url(
+    served: Served, tmp_path: Path
+) -> None:
+    url = f"{served.url}/bank"
+
+    def cached() -> ImageCache:
+        scans = open_scans(url)
+        folder = tmp_path / "cache"
+        return cache_scans(scans, scans.sensor, ["range"], folder, progress=False)
+
+    first = cached().fields["range"]
+    assert np.array_equal(cached().fields["range"], first)
+    write_bank(tmp_path / "bank", [some_image(i) for i in range(5, 10)])
+    with pytest.raises(ConfigError, match=r"of other data \(files differ"):
+        cached()
 
 
 @pytest.mark.slow

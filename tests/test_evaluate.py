@@ -158,6 +158,31 @@ def test_the_options_of_reading_are_of_both_sets_where_these_need_them(
     assert found[0] == found[1]
 
 
+def test_damage_of_the_second_set_is_not_hidden_by_options_of_the_first(
+    folders: tuple[Path, Path], tmp_path: Path
+) -> None:
+    scan = random_scan(presets()["town"], 1500)
+    np.column_stack([scan.points, scan.reflectance]).astype(np.float32).tofile(
+        tmp_path / "0.bin"
+    )
+    write_bank(tmp_path / "bank", [some_image(1, presets()["town"])])
+    (shard,) = (tmp_path / "bank").glob("shard-*.h5")
+    shard.write_bytes(b"x" * shard.stat().st_size)
+    options = ["--protocol", "town", "--sensor", "town", "--reflectance-max", "1"]
+    call = ["evaluate", str(tmp_path / "0.bin"), str(tmp_path / "bank"), *options]
+    assert "lidar-synth repair" in str(CliRunner().invoke(app, call).exception)
+
+
+def test_scans_of_both_sets_are_skipped(
+    folders: tuple[Path, Path], tmp_path: Path
+) -> None:
+    shutil.copytree(folders[1], tmp_path / "fake")
+    (tmp_path / "fake" / "000002.npz").write_bytes(b"PK")
+    call = ["evaluate", str(folders[0]), str(tmp_path / "fake"), "--protocol", "town"]
+    result = CliRunner().invoke(app, [*call, "--on-bad", "skip", "--json"])
+    assert result.exception is None, result.exception
+
+
 def test_a_measure_without_a_place_in_a_table_is_left_out_by_its_title(
     folders: tuple[Path, Path],
 ) -> None:

@@ -166,6 +166,13 @@ def test_a_dry_run_says_minutes_and_disk_and_writes_nothing(
     assert not list(tmp_path.iterdir())
 
 
+def test_scans_that_may_be_skipped_are_said_not_to_be_compared(tmp_path: Path) -> None:
+    MAKERS["semantic_kitti"](tmp_path / "scans")
+    given = ["start", str(tmp_path / "scans"), "--on-bad", "skip", "--dry-run"]
+    result = CliRunner().invoke(app, [*given, "--out", str(tmp_path / "start")])
+    assert "not compared with real scans only: scans may be skipped" in result.output
+
+
 @pytest.mark.slow
 def test_labelled_scans_are_compared_and_mixed(tmp_path: Path) -> None:
     root = tmp_path / "scans"
@@ -288,14 +295,22 @@ def test_configurations_are_of_any_folder(
     if "train.sh" in files:
         show = """{ printf '%s\\n' "$LIDAR_SYNTH_MIX" "$@"; }"""
         script = f"python() {show}\nln() {show}\n{files['train.sh']}"
-        said = subprocess.run(["bash", "-c", script], cwd=here, capture_output=True)
-        words |= set(said.stdout.decode().splitlines())
+        (here / "configs").mkdir()
+        for name in ("ARCH.yaml", "configs/WaffleIron-48-256__kitti.yaml"):
+            (here / name).touch()  # the trainer's own
+        words |= set(
+            subprocess.check_output(
+                ["bash", "-ec", script], cwd=here, text=True
+            ).splitlines()
+        )
         assert f"{here}/mix.yaml" in words
     for path in here.glob("cylinder3d.yaml"):
         words.add(yaml.safe_load(path.read_text())["data_path"])
-    # Pointcept's is in a comment.
-    roots = {f"/data/{ODD}", f"/data/{ODD}/sequences/", f"{here}/kitti"}
-    assert roots & words
+    there = {
+        "cylinder3d": f"/data/{ODD}/sequences/",
+        "pointcept": f"{here}/kitti",  # the root itself is in a comment
+    }
+    assert there.get(trainer, f"/data/{ODD}") in words
 
 
 def test_names_of_folders_may_be_no_text(tmp_path: Path) -> None:

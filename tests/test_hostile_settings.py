@@ -141,7 +141,10 @@ def test_yaml_that_is_not_text_is_refused(tmp_path: Path) -> None:
 
 def test_a_key_that_stands_twice_is_refused() -> None:
     for text in ("seed: 1\nsteps: 2\nseed: 3", "a: {seed: 1, 'seed': 3}"):
-        with pytest.raises(ConfigError, match="the key 'seed' stands twice"):
+        line = 1 + text.count("\n")
+        with pytest.raises(
+            ConfigError, match=f"line {line}: the key 'seed' stands twice"
+        ):
             parse_yaml(text, "here")
     merged = "{a: {c: &c {<<: {x: 1}, x: 2}}, b: {<<: *c}}"
     assert parse_yaml(merged, "here")["b"] == {"x": 2}

@@ -76,7 +76,9 @@ def check_settings(plan: BakePlan) -> BakePlan:
     with suppress(ValueError, LookupError, TypeError, RecursionError):
         recorded = json.loads(text)
         more = plan.job.count - recorded["count"]
-        if recorded["first"] == plan.job.first and more > 0:
+        grown = {name: plan.settings[name] for name in ("count", "shard_size")}
+        wanted = json.loads(json.dumps(plan.settings))
+        if more > 0 and recorded | grown == wanted:
             hint = (
                 " To add scans, bake another bank with --first "
                 f"{plan.job.first + recorded['count']} --count {more}, then lidar-synth bank merge."

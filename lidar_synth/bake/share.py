@@ -56,7 +56,7 @@ def read_share(index: str | None, number: int | None) -> Share:
             "the index of this run's share",
             "--shard-index auto in an array job.",
         )
-    index = index or "0"
+    index = "0" if index is None else index
     size = "1" if number is None else str(number)
     if index == "auto":
         found = next((name for name in _ARRAYS if name in os.environ), None)

@@ -8,7 +8,6 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any, overload
 
@@ -298,9 +297,10 @@ def _touch(shards: OrderedDict[int, ShardReader], number: int, most: int) -> Non
 def is_bank(path: str | Path) -> bool:
     """Whether a folder holds a bank: complete, damaged, or begun."""
     index = Path(path) / INDEX  # other programs have files of this name
-    begun = index.parent.glob(".bake.json"), index.parent.glob("shard-*.h5")
-    return any(chain(*begun)) or (
-        index.is_file() and FORMAT[:-1] in read_start(index, 1 << 20)
+    return (
+        (index.parent / ".bake.json").is_file()
+        or any(index.parent.glob("shard-*.h5"))
+        or (index.is_file() and FORMAT[:-1] in read_start(index, 1 << 20))
     )
 
 

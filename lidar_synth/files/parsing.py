@@ -13,7 +13,6 @@ import tarfile
 import warnings
 import zipfile
 import zlib
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from io import BytesIO
@@ -157,10 +156,15 @@ class _Loader(yaml.SafeLoader):
 
     def compose_mapping_node(self, anchor: Any) -> Any:
         node = super().compose_mapping_node(anchor)
-        keys = Counter((key.tag, str(key.value)) for key, _ in node.value)
-        for (_, key), count in keys.most_common(1):
-            if count > 1:
-                raise yaml.YAMLError(f"the key {shorten(key, 100)!r} stands twice")
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):  # others cannot be keys
+                if (key.tag, key.value) in seen:
+                    raise yaml.YAMLError(
+                        f"line {key.start_mark.line + 1}: the key "
+                        f"{shorten(key.value, 100)!r} stands twice"
+                    )
+                seen.add((key.tag, key.value))
         return node
 
 

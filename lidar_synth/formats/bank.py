@@ -45,7 +45,7 @@ class BankScans(ScanFiles):
                 f"sensor {sensor} for {root}",
                 f"{self.bank.sensor.name!r}, whose scans it holds",
             )
-        place: Any = self.bank.root
+        place: Any = self.bank.root  # text where it is a URL
         super().__init__(place, self.bank.ids, None, on_bad, stored=self.bank.sensor)
         self.options["bank"] = self.bank.identity
 

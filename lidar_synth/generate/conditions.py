@@ -414,9 +414,8 @@ def batch_of(
             "an array, a Scan, or a list of them",
             "load_layout(path) reads a layout." if name == "layout" else "",
         )
-    if isinstance(
-        given, np.ndarray
-    ):  # torch takes no flipped one, and warns of read-only ones
+    if isinstance(given, np.ndarray):
+        # torch refuses flipped arrays and warns of read-only ones
         given = np.require(given, requirements=["C", "W"])
     values = torch.as_tensor(given)
     if values.is_floating_point() or values.is_complex() or values.dtype == torch.bool:

@@ -203,15 +203,19 @@ def evaluate(
 
 def _open_fake(path: Path, given: dict[str, Any]) -> "Source":
     """FAKE, with the options of REAL but its layout and split, where it is not read without."""
-    from lidar_synth.errors import DataError
+    from lidar_synth.errors import ConfigError, DataError
     from lidar_synth.formats import open_scans
 
+    plain = {name: given[name] for name in ("sensor", "on_bad") if name in given}
     try:
-        source = open_scans(path, sensor=given.get("sensor"))
+        source = open_scans(path, **plain)
         source.load(0)
-    except DataError:
-        return open_scans(path, **given | {"layout": None, "split": None})
-    return source
+        return source
+    except DataError as error:
+        try:
+            return open_scans(path, **given | {"layout": None, "split": None})
+        except ConfigError:  # its layout does not take them
+            raise error from None
 
 
 def _print(figures: object, text: str, as_json: bool) -> None:

@@ -123,6 +123,15 @@ class StartPlan:
         """Whether the scans are of one drive, with no poses that tell places apart."""
         return self.found.drives == 1 and _places(self) == "stretch"
 
+    @property
+    def uncompared(self) -> str:
+        """Why trainings are not compared; empty if they are."""
+        if not self.minutes:
+            return "left out"
+        if getattr(self.found.source, "on_bad", "") == "skip":
+            return "scans may be skipped; lidar-synth convert --on-bad skip leaves them out"
+        return "no labels" if self.task == "unlabelled" else ""
+
     def settings(self) -> dict[str, Any]:
         """The mixture, as trainers read it."""
         settings: dict[str, Any] = {
@@ -325,9 +334,8 @@ def _make_scans(plan: StartPlan) -> None:
 
 def _compare(plan: StartPlan, say: Callable[[str], None]) -> str:
     """Train with and without synthetic scans; the result in words, or why there is none."""
-    if plan.task == "unlabelled" or not plan.minutes:
-        why = "no labels" if plan.minutes else "left out"
-        return f"Not compared with real scans only: {why}."
+    if plan.uncompared:
+        return f"Not compared with real scans only: {plan.uncompared}."
     proof = plan.out / "proof"
     say(f"\ncomparison with real scans only, at most {plan.minutes:g} minutes: {proof}")
     try:
@@ -407,7 +415,9 @@ def _estimate(plan: StartPlan) -> str:
         seconds = expected.seconds / plan.jobs
         size = expected.bytes
     lines = [f"{plan.scans} synthetic scans: {_cost(seconds / 60, size)}"]
-    if plan.task != "unlabelled" and plan.minutes:
+    if plan.uncompared:
+        lines.append(f"not compared with real scans only: {plan.uncompared}")
+    else:
         rows, _ = plan.found.source.sensor.shape
         pools = 0 if plan.cast else 150 * rows * 512 * 20.0
         lines.append(

@@ -15,7 +15,7 @@ from torch import Tensor
 from lidar_synth.bank.encoding import LEVELS, TYPES, Encoding
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names
-from lidar_synth.formats import RangePNG, ScanFiles
+from lidar_synth.formats import BankScans, RangePNG, ScanFiles
 from lidar_synth.generate.codec import Codec
 from lidar_synth.geometry import Scan, Sensor, Source
 from lidar_synth.geometry.normalize import TensorFormat
@@ -160,6 +160,9 @@ def _hash_of_files(source: Any, cache: Path, fields: Set[str]) -> str | None:
         if isinstance(part, ScanFiles):
             plain = fields <= DTYPES.keys() and not isinstance(part, RangePNG)
             told += part.ids
+            if isinstance(part, BankScans):  # may be at a URL
+                told.append(part.bank.identity)
+                continue
             for place in part.files_for(fields):
                 told += _tell_files(place, cache, CAMERA_SUFFIXES if plain else ())
     return hash_of_names(told) if told else None
