@@ -40,11 +40,11 @@ from lidar_synth.bake.folder import (
     prepare,
     write_bank_files,
 )
-from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import regenerate, verify
 from lidar_synth.bank import INDEX, Bank, Encoding, Entry, Index
 from lidar_synth.bank.card import CARD, CROISSANT
+from lidar_synth.bank.index import SETTINGS
 from lidar_synth.cli import app
 from lidar_synth.cli.bake import _resources
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError

@@ -26,8 +26,8 @@ import lidar_synth.bake.run as run_module
 import lidar_synth.bake.shard as shard_module
 from lidar_synth.bake import ENGINES, BakePlan, Resources, Share, bake, bake_shard
 from lidar_synth.bake.folder import prepare
-from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bank import INDEX, Index
+from lidar_synth.bank.index import SETTINGS
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.processes import GUARD
 from lidar_synth.formats.writer import NOTES

@@ -16,7 +16,7 @@ from test_generator import write
 import lidar_synth.bake.ray_actors as module
 from lidar_synth.bake import ENGINES, BakePlan, Resources, bake
 from lidar_synth.bake.folder import finish, prepare
-from lidar_synth.bake.remote import SETTINGS
+from lidar_synth.bank.index import SETTINGS
 from lidar_synth.errors import ConfigError, FileError
 
 ray = pytest.importorskip(

@@ -14,8 +14,8 @@ from test_generator import write
 
 from lidar_synth.bake import ENGINES, BakePlan, Resources, bake
 from lidar_synth.bake.folder import prepare
-from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.slurm import LOGS, SlurmTask
+from lidar_synth.bank.index import SETTINGS
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import write_file
 

@@ -23,10 +23,10 @@ from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.bake.edit import head, merge, split
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.making import NOTE
-from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import AGREE, regenerate, verify
 from lidar_synth.bank import INDEX, Bank, Index
+from lidar_synth.bank.index import SETTINGS
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import sha256

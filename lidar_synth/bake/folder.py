@@ -20,10 +20,11 @@ from pathlib import Path
 
 from lidar_synth.bake import remote
 from lidar_synth.bake.job import BakePlan, settings_of
-from lidar_synth.bake.remote import SETTINGS, refuse_others
+from lidar_synth.bake.remote import refuse_others
 from lidar_synth.bank import INDEX, Entry, Index
 from lidar_synth.bank.card import card_files
 from lidar_synth.bank.folder import BankFolder, open_folder
+from lidar_synth.bank.index import SETTINGS
 from lidar_synth.bank.reader import read_index
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.claims import compare

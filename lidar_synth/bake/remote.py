@@ -20,10 +20,6 @@ from lidar_synth.bank.reader import read_index
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.writer import NOTES
 
-SETTINGS = ".bake.json"
-"""File in the bank's folder with the settings of the bake; on a disk, runs that fill the folder
-hold a lock on it."""
-
 SHARD = re.compile(r"[^/]+\.h5")
 """The name of a shard; those of banks in folders below have a slash."""
 

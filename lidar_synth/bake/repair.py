@@ -12,7 +12,7 @@ from lidar_synth.bake.folder import is_claimed, write_bank_files
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.making import NOTE
 from lidar_synth.bake.options import BakeJob
-from lidar_synth.bake.remote import SETTINGS, SHARD
+from lidar_synth.bake.remote import SHARD
 from lidar_synth.bake.shard import load_checked, write_shard
 from lidar_synth.bake.verify import (
     check_scans,
@@ -22,6 +22,7 @@ from lidar_synth.bake.verify import (
 )
 from lidar_synth.bank import INDEX, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.folder import BankFolder, open_folder
+from lidar_synth.bank.index import SETTINGS
 from lidar_synth.bank.reader import read_index
 from lidar_synth.bank.storage import bank_root, open_storage
 from lidar_synth.errors import ConfigError, DataError, FileError

@@ -11,11 +11,12 @@ import torch
 from tqdm import tqdm
 
 from lidar_synth.bake.options import BakeJob
-from lidar_synth.bake.remote import SETTINGS, SHARD
+from lidar_synth.bake.remote import SHARD
 from lidar_synth.bake.shard import generate, load_checked, torch_threads
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.card import CARD, CROISSANT
 from lidar_synth.bank.folder import BankFolder, open_folder
+from lidar_synth.bank.index import SETTINGS
 from lidar_synth.bank.reader import read_index
 from lidar_synth.bank.storage import bank_root
 from lidar_synth.errors import DataError, FileError

@@ -61,6 +61,10 @@ boxes."""
 LAYOUTS = ("plain", "paged")
 INDEX = "index.json"
 
+SETTINGS = ".bake.json"
+"""File in the bank's folder with the settings of the bake; on a disk, runs that fill the folder
+hold a lock on it."""
+
 SCAN_NUMBERS = 20
 """Bytes of a scan's seed, index and CRC: the minimum size of a scan."""
 

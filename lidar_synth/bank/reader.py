@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, overload
 
 from lidar_synth.bank.cache import ShardCache
-from lidar_synth.bank.index import FORMAT, INDEX, REPAIR, Facts, Index
+from lidar_synth.bank.index import FORMAT, INDEX, REPAIR, SETTINGS, Facts, Index
 from lidar_synth.bank.shard import ShardReader
 from lidar_synth.bank.storage import RemoteFile, bank_root, open_storage
 from lidar_synth.errors import ConfigError, DataError, FileError
@@ -298,7 +298,7 @@ def is_bank(path: str | Path) -> bool:
     """Whether a folder holds a bank: complete, damaged, or begun."""
     index = Path(path) / INDEX  # other programs have files of this name
     return (
-        (index.parent / ".bake.json").is_file()
+        (index.parent / SETTINGS).is_file()
         or any(index.parent.glob("shard-*.h5"))
         or (index.is_file() and FORMAT[:-1] in read_start(index, 1 << 20))
     )

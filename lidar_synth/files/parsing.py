@@ -177,7 +177,7 @@ def parse_yaml(text: str, where: str) -> Any:
     """
     try:
         fault = _yaml_fault(yaml.parse(text, Loader=yaml.SafeLoader))
-        values = None if fault else yaml.load(text, _Loader)
+        values = None if fault else _Loader(text).get_single_data()
     # a date such as 2001-99-99 is a ValueError
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         raise ConfigError(

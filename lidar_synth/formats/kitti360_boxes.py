@@ -29,8 +29,7 @@ from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import numbers, reading, write_file
 from lidar_synth.geometry import FARTHEST, Boxes
-
-Floats = NDArray[np.float64]
+from lidar_synth.geometry.arrays import Float64Array
 
 MARGIN = 100
 """Maximum distance in frames (about 80 m) from an object's window at which the object is listed."""
@@ -100,13 +99,13 @@ class WorldBoxes:
             listed, whatever their class.
     """
 
-    transforms: Floats
+    transforms: Float64Array
     names: NDArray[np.str_]
     instances: NDArray[np.int32]
     windows: NDArray[np.int64]
     annotated: NDArray[np.int64]
 
-    def at(self, frame: int, pose: Floats, range_max: float) -> Boxes | None:
+    def at(self, frame: int, pose: Float64Array, range_max: float) -> Boxes | None:
         """The boxes around one scan, in its sensor frame; None if no window covers the frame.
 
         Args:
@@ -194,11 +193,13 @@ def read_boxes(path: Path) -> WorldBoxes:
     return found
 
 
-def _matrix(node: ElementTree.Element, tag: str, shape: tuple[int, ...]) -> Floats:
+def _matrix(
+    node: ElementTree.Element, tag: str, shape: tuple[int, ...]
+) -> Float64Array:
     return np.array(node.findtext(f"{tag}/data", "").split(), np.float64).reshape(shape)
 
 
-def _unit_cube(vertices: Floats) -> Floats:
+def _unit_cube(vertices: Float64Array) -> Float64Array:
     """(4, 4) transform from the unit cube around the origin to the box of the vertices, usually the
     identity."""
     low = vertices.min(axis=0)
@@ -208,7 +209,7 @@ def _unit_cube(vertices: Floats) -> Floats:
     return matrix
 
 
-def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, Floats]]) -> None:
+def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, Float64Array]]) -> None:
     """Write the boxes of frames, or add them to those of other frames in an existing file.
 
     Args:
@@ -261,7 +262,7 @@ def _read_others(path: Path, frames: Container[int]) -> ElementTree.Element:
     return root
 
 
-def _objects(frame: int, boxes: Boxes, pose: Floats) -> list[ElementTree.Element]:
+def _objects(frame: int, boxes: Boxes, pose: Float64Array) -> list[ElementTree.Element]:
     nodes = []
     # Numbers for unknown instances: no other box of the frame has them, whatever its class.
     numbered = boxes.instance % MAX_INSTANCES

@@ -13,7 +13,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import (
@@ -31,8 +30,7 @@ from lidar_synth.formats.calibration import (
     ideal_camera,
     read_image_size,
 )
-
-Floats = NDArray[np.float64]
+from lidar_synth.geometry.arrays import Float64Array
 
 CAMERA = ideal_camera(552.554261, (1408, 376))
 """The camera that is written if none is known: image_00's size and focal length, at the sensor."""
@@ -125,7 +123,7 @@ def write_calibration(root: Path, camera: Calibration) -> None:
     write_named_matrices(folder / "perspective.txt", matrices)
 
 
-def imu_from_sensor(camera: Calibration | None) -> Floats:
+def imu_from_sensor(camera: Calibration | None) -> Float64Array:
     """(4, 4) from the velodyne to the IMU, whose poses ``poses.txt`` holds."""
     if camera is None or not {"image_00", "cam_to_velo"} <= set(camera.matrices):
         return IMU_FROM_SENSOR
@@ -133,7 +131,9 @@ def imu_from_sensor(camera: Calibration | None) -> Floats:
     return homogeneous(camera.matrices["image_00"]) @ np.linalg.inv(cam_to_velo)
 
 
-def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, Floats]:
+def read_poses(
+    root: Path, drive: str, camera: Calibration | None
+) -> dict[int, Float64Array]:
     """{frame: (4, 4) velodyne to world}; empty without ``poses.txt`` or calibration. Not every
     frame has a pose.
 
@@ -162,7 +162,7 @@ def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, 
     )
 
 
-def write_poses(root: Path, drive: str, poses: dict[int, Floats]) -> None:
+def write_poses(root: Path, drive: str, poses: dict[int, Float64Array]) -> None:
     """The inverse of ``read_poses``, with the calibration in ``root``; poses of other frames in the
     files stay.
 
@@ -197,7 +197,9 @@ def _add_lines(path: Path, lines: dict[int, str]) -> None:
     write_file(path, "".join(text).encode())
 
 
-def fill_poses(poses: dict[int, Floats], frames: Iterable[int]) -> dict[int, Floats]:
+def fill_poses(
+    poses: dict[int, Float64Array], frames: Iterable[int]
+) -> dict[int, Float64Array]:
     """Poses of further frames, between two known poses that are at most ``STILL`` apart.
 
     The dataset leaves out frames in which the car hardly moved.

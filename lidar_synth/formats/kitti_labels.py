@@ -17,8 +17,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.geometry import FARTHEST, Boxes, wrap_angle
-
-Floats = NDArray[np.float64]
+from lidar_synth.geometry.arrays import Float64Array
 
 _FIELDS = "15 fields: a name and 14 numbers"
 
@@ -57,7 +56,7 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
     )
 
 
-def _split_fields(text: str, path: Path) -> tuple[list[str], Floats]:
+def _split_fields(text: str, path: Path) -> tuple[list[str], Float64Array]:
     """The names, and the (M, 14) numbers that follow them."""
     rows = [line.split() for line in text.splitlines() if line.strip()]
     bad = [row for row in rows if len(row) not in (15, 16)]
@@ -70,7 +69,7 @@ def _split_fields(text: str, path: Path) -> tuple[list[str], Floats]:
     return [row[0] for row in rows], values
 
 
-def _check_values(values: Floats, ignored: NDArray[np.bool_], path: Path) -> None:
+def _check_values(values: Float64Array, ignored: NDArray[np.bool_], path: Path) -> None:
     """Refuse impossible values: not finite, far beyond any sensor's range, or wrong sizes and
     occlusions."""
     within = np.abs(values) <= FARTHEST  # NaN is not
@@ -85,9 +84,9 @@ def _check_values(values: Floats, ignored: NDArray[np.bool_], path: Path) -> Non
 
 
 def boxes_from_camera(
-    floor: Floats,
-    size: Floats,
-    rotation_y: Floats,
+    floor: Float64Array,
+    size: Float64Array,
+    rotation_y: Float64Array,
     camera: Calibration,
 ) -> NDArray[np.float32]:
     """(M, 7) boxes in the sensor frame; the inverse of ``boxes_to_camera``.
@@ -113,7 +112,7 @@ def boxes_from_camera(
 
 def boxes_to_camera(
     values: NDArray[np.float32], camera: Calibration
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """``floor``, ``size`` and ``rotation_y`` of ``boxes_from_camera`` for (M, 7) boxes in the
     sensor frame."""
     values = values.astype(np.float64)
@@ -171,7 +170,7 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     write_file(path, text.encode())
 
 
-def in_image(boxes: Boxes, camera: Calibration) -> tuple[Floats, Floats]:
+def in_image(boxes: Boxes, camera: Calibration) -> tuple[Float64Array, Float64Array]:
     """(M, 4) image boxes and (M,) truncations; unknown ones are computed from the corners, and
     stay below 0 outside of the view."""
     image_box = boxes.image_box.astype(np.float64)

@@ -16,8 +16,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import SKIP_HINT, reading, refuse_special, write_file
 from lidar_synth.formats.calibration import check_rigid
 from lidar_synth.geometry import FARTHEST, Scan
-
-Floats = NDArray[np.float32]
+from lidar_synth.geometry.arrays import Float32Array
 
 LONGEST = 60.0
 """Maximum time of a point from the moment of its scan's pose, seconds."""
@@ -34,7 +33,7 @@ _bad_points_kept = ContextVar("bad points kept", default=False)
 
 def read_points(
     path: Path, fields: int = 4, reflectance_max: float | None = None
-) -> Floats:
+) -> Float32Array:
     """Read the points of a raw ``.bin`` file: little-endian float32, ``fields`` per point, no
     header.
 
@@ -102,8 +101,8 @@ def write_points(path: Path, scan: Scan) -> None:
 
 
 def check_points(
-    points: Floats,
-    reflectance: Floats,
+    points: Float32Array,
+    reflectance: Float32Array,
     where: str,
     reflectance_max: float = 1.0,
 ) -> None:
@@ -145,7 +144,7 @@ def check_points(
         )
 
 
-def finite(points: Floats, reflectance: Floats) -> NDArray[np.bool_]:
+def finite(points: Float32Array, reflectance: Float32Array) -> NDArray[np.bool_]:
     """(N,) True for points whose coordinates and reflectance are finite."""
     good: NDArray[np.bool_] = np.isfinite(points).all(axis=1) & np.isfinite(reflectance)
     return good
@@ -212,7 +211,9 @@ def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
         check_rigid(scan.pose, f"{where}: its pose")
 
 
-def _find_bad_value(points: Floats, reflectance: Floats, where: str) -> None:
+def _find_bad_value(
+    points: Float32Array, reflectance: Float32Array, where: str
+) -> None:
     bad = np.flatnonzero(~finite(points, reflectance))
     if len(bad):
         raise DataError(

@@ -15,9 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.sensor import Sensor
-
-Floats = NDArray[np.float64]
 
 NEAR = 5.0
 FAR = 15.0
@@ -151,9 +150,9 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
 
 
 def _compare(
-    points: Floats,
-    beams: Floats,
-    heights: Floats,
+    points: Float64Array,
+    beams: Float64Array,
+    heights: Float64Array,
     exact: bool,
 ) -> tuple[float, float, float, float, float]:
     """``above``, ``below``, ``gaps``, ``unused`` and ``between`` for beams at these elevations,
@@ -183,9 +182,9 @@ def _compare(
 
 
 def _between(
-    elevation: Floats,
+    elevation: Float64Array,
     sector: NDArray[np.intp],
-    beams: Floats,
+    beams: Float64Array,
     exact: bool,
 ) -> float:
     """Share of points between the beams, with the tilt of each sector that leaves the fewest

@@ -7,10 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.scan import Scan
-
-Floats = NDArray[np.float64]
-
 
 EXTENSION = 1.5
 """How far a trajectory is extrapolated before its first and after its last pose, in lengths of the
@@ -68,7 +66,7 @@ class Trajectory:
                 "rigid poses, sensor to world",
             )
 
-    def at(self, time: float) -> Floats:
+    def at(self, time: float) -> Float64Array:
         """(4, 4) the pose at one moment."""
         pose = np.eye(4)
         segment, fraction = self._segments(np.array([time]))
@@ -77,26 +75,28 @@ class Trajectory:
         pose[:3, :3] = self.poses[segment[0], :3, :3] @ turned.as_matrix()
         return pose
 
-    def from_world(self, points: Floats, times: Floats) -> Floats:
+    def from_world(self, points: Float64Array, times: Float64Array) -> Float64Array:
         """(N, 3) points of the world in the frame that the sensor had at the time of each."""
         segment, fraction = self._segments(times)
         offset = points - self._positions(segment, fraction)
         local = np.einsum("nji,nj->ni", self.poses[segment, :3, :3], offset)
         return rotate(np.asarray(local), -fraction[:, None] * self._steps[segment])
 
-    def to_world(self, points: Floats, times: Floats) -> Floats:
+    def to_world(self, points: Float64Array, times: Float64Array) -> Float64Array:
         """(N, 3) points in the world, from the frame that the sensor had at the time of each."""
         segment, fraction = self._segments(times)
         turned = rotate(points, fraction[:, None] * self._steps[segment])
         turned = np.einsum("nij,nj->ni", self.poses[segment, :3, :3], turned)
         return np.asarray(turned + self._positions(segment, fraction))
 
-    def _positions(self, segment: NDArray[np.intp], fraction: Floats) -> Floats:
+    def _positions(
+        self, segment: NDArray[np.intp], fraction: Float64Array
+    ) -> Float64Array:
         start = self.poses[segment, :3, 3]
         end = self.poses[segment + 1, :3, 3]
         return np.asarray(start + fraction[:, None] * (end - start))
 
-    def _segments(self, times: Floats) -> tuple[NDArray[np.intp], Floats]:
+    def _segments(self, times: Float64Array) -> tuple[NDArray[np.intp], Float64Array]:
         """The segment of each time (N,), and the fraction of the segment that has passed;
         ``EXTENSION`` before the first and after the last one is accepted."""
         segment = np.clip(
@@ -168,7 +168,7 @@ def deskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
     )
 
 
-def _times(scan: Scan, moment: float) -> Floats:
+def _times(scan: Scan, moment: float) -> Float64Array:
     if scan.time is None:
         raise DataError(
             f"scan {scan.id!r} has no time", "seconds for each point in scan.time"
@@ -176,7 +176,7 @@ def _times(scan: Scan, moment: float) -> Floats:
     return moment + scan.time.astype(np.float64)
 
 
-def rotate(points: Floats, vectors: Floats) -> Floats:
+def rotate(points: Float64Array, vectors: Float64Array) -> Float64Array:
     """(N, 3) points turned by rotation vectors (N, 3) or (3,), radians (Rodrigues' formula)."""
     # Not by scipy, whose older versions refuse empty arrays.
     angle = np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -5,25 +5,28 @@ tan(e), where rho is the horizontal distance from the axis: a line per beam.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from lidar_synth.geometry.arrays import Float64Array, Int64Array
 
 CHUNK = 1 << 15
 """Number of points that are compared with all beams at a time."""
 
 
 def residuals(
-    points: Floats, ring: Integers, tangents: Floats, heights: Floats
-) -> Floats:
+    points: Float64Array,
+    ring: Int64Array,
+    tangents: Float64Array,
+    heights: Float64Array,
+) -> Float64Array:
     """(N,) angle between each point and its beam, radians; upward is positive."""
     rho = np.hypot(points[:, 0], points[:, 1])
     above = points[:, 2] - heights[ring]
     return np.asarray(np.arctan2(above, rho) - np.arctan(tangents[ring]))
 
 
-def nearest_beams(points: Floats, tangents: Floats, heights: Floats) -> Integers:
+def nearest_beams(
+    points: Float64Array, tangents: Float64Array, heights: Float64Array
+) -> Int64Array:
     """(N,) the beam that passes nearest to each point, by angle."""
     if not np.ptp(heights):
         order = np.argsort(tangents)

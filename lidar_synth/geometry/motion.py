@@ -6,18 +6,18 @@ before and after, each point has a pose of its own, the one at the time of its m
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-
-Floats = NDArray[np.float64]
+from lidar_synth.geometry.arrays import Float64Array
 
 FARTHEST = 1.0
 """Maximum time in seconds before the first pose or after the last one for which a pose is
 extrapolated."""
 
 
-def interpolate_poses(times: Floats, poses: Floats, at: Floats) -> Floats:
+def interpolate_poses(
+    times: Float64Array, poses: Float64Array, at: Float64Array
+) -> Float64Array:
     """The poses at other times: between two poses, velocity and angular velocity are constant.
 
     Before the first pose and after the last one, the motion of the nearest interval continues.
@@ -76,7 +76,7 @@ def interpolate_poses(times: Floats, poses: Floats, at: Floats) -> Floats:
     return result
 
 
-def from_world(points: Floats, poses: Floats) -> Floats:
+def from_world(points: Float64Array, poses: Float64Array) -> Float64Array:
     """Points of the world in the frame of a pose each.
 
     Args:
@@ -93,8 +93,8 @@ def from_world(points: Floats, poses: Floats) -> Floats:
 
 
 def _axes_and_angles(
-    rotations: Floats,
-) -> tuple[Floats, Floats]:
+    rotations: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
     """(P, 3) unit axes and (P,) angles in [0, pi], radians, of (P, 3, 3) rotations between
     poses."""
     twice_sine = np.stack(
@@ -115,7 +115,7 @@ def _axes_and_angles(
     return twice_sine / np.maximum(length, 1e-300)[:, None], angles
 
 
-def _rotations(axes: Floats, angles: Floats) -> Floats:
+def _rotations(axes: Float64Array, angles: Float64Array) -> Float64Array:
     """(N, 3, 3) rotations about unit axes by angles, by Rodrigues' formula."""
     cross = np.zeros((len(axes), 3, 3))
     cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0] = axes.T

@@ -8,17 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry import Boxes, wrap_angle
+from lidar_synth.geometry.arrays import Float32Array
 
-Floats = NDArray[np.float32]
 
-
-def box_frame(points: Floats, box: Floats) -> Floats:
+def box_frame(points: Float32Array, box: Float32Array) -> Float32Array:
     """Transform points into the frame of one box (7,): (N, 3) metres along, across and above its
     centre."""
     return turn_points(points - box[:3], -box[6])
 
 
-def grow_box(box: Floats, points: Floats) -> Floats:
+def grow_box(box: Float32Array, points: Float32Array) -> Float32Array:
     """Enlarge a box (7,) about its centre so that it contains points (N, 3).
 
     A margin of one millimetre ensures that it still contains them when both are moved in float32.
@@ -29,7 +28,7 @@ def grow_box(box: Floats, points: Floats) -> Floats:
     )
 
 
-def move_boxes(boxes: Boxes, values: Floats) -> Boxes:
+def move_boxes(boxes: Boxes, values: Float32Array) -> Boxes:
     """The boxes with new values (M, 7): without their boxes in the camera image, and with yaw in
     [-pi, pi)."""
     values = values.astype(np.float32)
@@ -71,7 +70,7 @@ def join_boxes(several: Sequence[Boxes]) -> Boxes:
     return Boxes(names=names, **arrays)
 
 
-def widen_boxes(values: Floats, margin: float) -> Floats:
+def widen_boxes(values: Float32Array, margin: float) -> Float32Array:
     """Boxes (..., 7) with a margin in metres on each of their four sides."""
     return values + np.array([0, 0, 0, 2 * margin, 2 * margin, 0, 0], np.float32)
 

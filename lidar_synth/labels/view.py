@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Scan, Sensor
+from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.geometry.projection import locate
 from lidar_synth.labels.ground import FLOOR
 from lidar_synth.labels.objects import Object
-
-Floats = NDArray[np.float32]
 
 
 @dataclass
@@ -27,7 +26,7 @@ class VisibleReturns:
     """
 
     cell: NDArray[np.int32]
-    range: Floats
+    range: Float32Array
     seen: NDArray[np.bool_]
     total: int
 
@@ -95,7 +94,7 @@ class Composition:
         self,
         row: NDArray[np.intp],
         column: NDArray[np.intp],
-        depth: Floats,
+        depth: Float32Array,
         top: np.float32,
     ) -> None:
         """Put cells (m,) at a depth in front of what is behind them, up to the height ``top``."""
@@ -122,7 +121,7 @@ def refuse_coarser(given: Sensor, wanted: Sensor) -> None:
         )
 
 
-def _close_gaps(front: Floats, height: Floats) -> None:
+def _close_gaps(front: Float32Array, height: Float32Array) -> None:
     """Fill each empty cell (inf) between two returns, vertically or horizontally, with the farther
     one."""
     for axis in (0, 1):
@@ -143,9 +142,9 @@ def _close_gaps(front: Floats, height: Floats) -> None:
 def _outline(
     row: NDArray[np.intp],
     column: NDArray[np.intp],
-    depth: Floats,
+    depth: Float32Array,
     columns: int,
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Float32Array]:
     """The cells of an object's outline: between its upper and lower returns, in all columns from
     its first to its last.
 

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.geometry import Scan
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.projection import project
-
-Floats = NDArray[np.float64]
 
 LOOKED_AT = 15_000
 """Approximate number of rows of a sample that are measured."""
@@ -76,7 +75,7 @@ class Table(NamedTuple):
         spatial: whether the first three columns are x, y, z.
     """
 
-    columns: Floats
+    columns: Float64Array
     label: NDArray[np.int64] | None
     spatial: bool
 
@@ -115,7 +114,7 @@ class Meaning:
     """
 
     points: float
-    quantiles: Floats
+    quantiles: Float64Array
     constant: NDArray[np.bool_]
     varied: NDArray[np.bool_]
     distance: float
@@ -187,13 +186,13 @@ def _thinned(table: Table) -> Table:
     return Table(table.columns[::step], label, table.spatial)
 
 
-def _median(values: Sequence[float] | Floats) -> float:
+def _median(values: Sequence[float] | Float64Array) -> float:
     known = np.asarray(values, np.float64)
     known = known[np.isfinite(known)]
     return float(np.median(known)) if len(known) else float("nan")
 
 
-def _floor_height(points: Floats) -> float:
+def _floor_height(points: Float64Array) -> float:
     """The median over squares of 2 m, 3 to 25 m away, of the height of their lowest points; NaN if
     there are few."""
     away = np.hypot(points[:, 0], points[:, 1])
@@ -208,7 +207,7 @@ def _floor_height(points: Floats) -> float:
     return float(np.median(lowest)) if len(lowest) >= 20 else float("nan")
 
 
-def _elongation(points: Floats) -> float:
+def _elongation(points: Float64Array) -> float:
     """The logarithm of how much farther the points reach in x than in y: above 0 on most roads,
     which run along x."""
     reach = np.quantile(np.abs(points[:, :2]), 0.95, axis=0)
@@ -216,7 +215,10 @@ def _elongation(points: Floats) -> float:
 
 
 def _measure_classes(
-    tables: Sequence[Table], height: Floats, distance: Floats, ignored: Sequence[int]
+    tables: Sequence[Table],
+    height: Float64Array,
+    distance: Float64Array,
+    ignored: Sequence[int],
 ) -> dict[int, ClassLook]:
     labels = [
         np.full(len(t.columns), ignored[0]) if t.label is None else t.label

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry.arrays import Int64Array
 from lidar_synth.mixing.permutation import permute, permute_blocks
 from lidar_synth.mixing.quotas import (
     Mixture,
@@ -33,8 +34,6 @@ from lidar_synth.mixing.quotas import (
     synthetic_before,
 )
 from lidar_synth.mixing.schedules import share_of
-
-Integers = NDArray[np.int64]
 
 VERSION = "lidar-synth-plan/2"
 """Part of every plan's hash; changes when the same mixture gives another order."""
@@ -107,7 +106,7 @@ class MixingPlan:
             self._cache[block] = entries
         return int(entries[0][offset]), int(entries[1][offset])
 
-    def at(self, positions: Integers) -> tuple[Integers, Integers]:
+    def at(self, positions: Int64Array) -> tuple[Int64Array, Int64Array]:
         """The sources and local indices, (N,) each, of (N,) positions, 0 <= position < length."""
         rank = (
             self._balanced(positions)
@@ -123,12 +122,12 @@ class MixingPlan:
         return source, index
 
     @property
-    def source(self) -> Integers:
+    def source(self) -> Int64Array:
         """(N,) the source at every position, computed on access."""
         return self.at(np.arange(len(self)))[0]
 
     @property
-    def index(self) -> Integers:
+    def index(self) -> Int64Array:
         """(N,) the local index at every position, computed on access."""
         return self.at(np.arange(len(self)))[1]
 
@@ -166,19 +165,19 @@ class MixingPlan:
         ).hexdigest()
 
     @cached_property
-    def _starts(self) -> Integers:
+    def _starts(self) -> Int64Array:
         """The first rank of each source."""
-        starts: Integers = np.cumsum((0, *self.counts[:-1]), dtype=np.int64)
+        starts: Int64Array = np.cumsum((0, *self.counts[:-1]), dtype=np.int64)
         return starts
 
     @cached_property
-    def _cache(self) -> dict[int, tuple[Integers, Integers]]:
+    def _cache(self) -> dict[int, tuple[Int64Array, Int64Array]]:
         return {}
 
-    def _shuffled(self, positions: Integers) -> Integers:
+    def _shuffled(self, positions: Int64Array) -> Int64Array:
         return permute(positions, len(self), self.mixture.seed, _ORDER, self.epoch)
 
-    def _balanced(self, positions: Integers) -> Integers:
+    def _balanced(self, positions: Int64Array) -> Int64Array:
         """Ranks with synthetic samples spread evenly over the epoch, and synthetic sources among
         them."""
         before = self._synthetic_up_to(positions)
@@ -192,7 +191,7 @@ class MixingPlan:
             rank[synthetic] = self._deal(before[synthetic])
         return rank
 
-    def _deal(self, before: Integers) -> Integers:
+    def _deal(self, before: Int64Array) -> Int64Array:
         """Ranks of synthetic samples, from the number of those before each in the epoch."""
         earlier = sum(self.before[self.reals :])
         source, number = deal(self.mixture.synthetic_weights, before + earlier)
@@ -204,7 +203,7 @@ class MixingPlan:
             rank[here] = start + self._ordered(each, within)
         return rank
 
-    def _ordered(self, source: int, numbers: Integers) -> Integers:
+    def _ordered(self, source: int, numbers: Int64Array) -> Int64Array:
         """The places in the epoch's order of a synthetic source's samples, numbered within the
         epoch; blocks begin at multiples of their size."""
         count = self.counts[source]
@@ -217,7 +216,7 @@ class MixingPlan:
             permute_blocks(numbers, count, block, *key) + int(-first[0]) % block
         ) % count
 
-    def _synthetic_up_to(self, positions: Integers) -> Integers:
+    def _synthetic_up_to(self, positions: Int64Array) -> Int64Array:
         """Number of synthetic samples among the first ``positions`` of the epoch: the exact number,
         rounded up.
 
@@ -230,7 +229,7 @@ class MixingPlan:
         ahead = floor((ceil(exact) - exact) * q)
         return -((ahead - positions * p) // q)
 
-    def _local(self, source: int, number: Integers) -> Integers:
+    def _local(self, source: int, number: Int64Array) -> Int64Array:
         """The local indices of a source's running numbers."""
         mixture = self.mixture
         if source < self.reals:

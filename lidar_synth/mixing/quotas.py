@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.arrays import Int64Array
 from lidar_synth.mixing.schedules import Schedule, constant_from, share_of
-
-Integers = NDArray[np.int64]
 
 EpochSize = Literal["add", "replace"] | int
 """The length of all epochs: ``"add"`` uses every real scan once and adds synthetic ones to reach
@@ -268,7 +267,7 @@ class _Node:
     right: "_Node | int"
 
 
-Number = TypeVar("Number", int, Integers)
+Number = TypeVar("Number", int, Int64Array)
 
 
 def split(weights: Sequence[Fraction], total: int) -> tuple[int, ...]:
@@ -293,7 +292,9 @@ def split(weights: Sequence[Fraction], total: int) -> tuple[int, ...]:
     return tuple(counts)
 
 
-def deal(weights: Sequence[Fraction], samples: Integers) -> tuple[Integers, Integers]:
+def deal(
+    weights: Sequence[Fraction], samples: Int64Array
+) -> tuple[Int64Array, Int64Array]:
     """The source of each sample, and its number within that source; consistent with ``split``.
 
     Args:
@@ -306,7 +307,7 @@ def deal(weights: Sequence[Fraction], samples: Integers) -> tuple[Integers, Inte
     sources = np.empty_like(samples)
     numbers = np.empty_like(samples)
 
-    def walk(node: _Node | int, where: NDArray[np.intp], number: Integers) -> None:
+    def walk(node: _Node | int, where: NDArray[np.intp], number: Int64Array) -> None:
         if isinstance(node, int):
             sources[where] = node
             numbers[where] = number

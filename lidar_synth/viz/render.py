@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry import Boxes, Scan
+from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.viz.scales import EMPTY, Rgb, Scale, make_scales, point_values
-
-Floats = NDArray[np.float32]
 
 SAMPLES = 2
 """Samples per pixel along each axis, averaged for antialiasing."""
@@ -52,7 +51,7 @@ class Camera:
 
     def look(
         self, points: NDArray[np.floating], size: tuple[int, int]
-    ) -> tuple[Floats, Floats, Floats]:
+    ) -> tuple[Float32Array, Float32Array, Float32Array]:
         """Project points (N, 3) into a picture of ``size`` (width, height) pixels.
 
         Returns:
@@ -115,12 +114,12 @@ def bird(extent: float = 50.0) -> Camera:
 
 
 def _splat(
-    pixels: Floats,
-    depth: Floats,
-    radius: Floats,
+    pixels: Float32Array,
+    depth: Float32Array,
+    radius: Float32Array,
     colours: Rgb,
     size: tuple[int, int],
-) -> tuple[Rgb, Floats]:
+) -> tuple[Rgb, Float32Array]:
     """Picture (h, w, 3) and depth buffer (h, w), inf = empty, of points drawn as discs; the nearest
     disc wins."""
     width, height = size
@@ -149,7 +148,7 @@ def _splat(
     return picture.reshape(height, width, 3), buffer.reshape(height, width)
 
 
-def _shade(picture: Rgb, buffer: Floats, strength: float = 40.0) -> Rgb:
+def _shade(picture: Rgb, buffer: Float32Array, strength: float = 40.0) -> Rgb:
     """Eye-dome lighting: darken a pixel by the log-depth differences to neighbours in front of
     it."""
     filled = np.isfinite(buffer)
@@ -172,7 +171,7 @@ def _shade(picture: Rgb, buffer: Floats, strength: float = 40.0) -> Rgb:
 
 def _lines(
     picture: Rgb,
-    buffer: Floats,
+    buffer: Float32Array,
     segments: NDArray[np.floating],
     camera: Camera,
     colour: tuple[int, int, int],
@@ -230,7 +229,7 @@ EDGES = np.array(
 """The 12 edges of a box, as indices of ``Boxes.corners``."""
 
 
-def box_segments(boxes: Boxes) -> Floats:
+def box_segments(boxes: Boxes) -> Float32Array:
     """(13 M, 2, 3) edges of the boxes, and for each box a line on its top from the centre to the
     front."""
     corners = boxes.corners()
@@ -242,7 +241,7 @@ def box_segments(boxes: Boxes) -> Floats:
     )
 
 
-def ring_segments(scan: Scan) -> Floats:
+def ring_segments(scan: Scan) -> Float32Array:
     """(S, 2, 3) circles on the ground every 10 m, which show distances."""
     near = scan.points[np.linalg.norm(scan.points[:, :2], axis=1) < 20, 2]
     ground = float(np.percentile(near, 5)) if len(near) else 0.0

@@ -31,13 +31,11 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidar_synth.geometry import Scan
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.weather.corruption import Change, Values, require_between
 from lidar_synth.weather.signal import SignalLoss, overlap, ranges_of
-
-Floats = NDArray[np.float64]
 
 WAVELENGTH = 905e-6
 """Wavelength of the laser, mm."""
@@ -52,7 +50,7 @@ _STEP = DIAMETERS[1] - DIAMETERS[0]
 _LEVELS = (np.arange(1024) + 0.5) / 1024
 
 
-def extinction_efficiency(diameter: Floats) -> Floats:
+def extinction_efficiency(diameter: Float64Array) -> Float64Array:
     """Mie's extinction efficiency Q of particles much larger than the wavelength, of any
     refractive index (Nussenzveig and Wiscombe 1980); diameters in mm."""
     size = np.pi * diameter / WAVELENGTH
@@ -71,7 +69,7 @@ class Precipitation(SignalLoss):
         require_between("rate", self.rate, 0.1, 200)
 
     @abstractmethod
-    def number(self) -> Floats:
+    def number(self) -> Float64Array:
         """n(D) by ``DIAMETERS``."""
 
     @cached_property
@@ -132,7 +130,7 @@ class Rain(Precipitation):
     SEVERE = {"rate": 5.0}, {"rate": 20.0}, {"rate": 60.0}
     reflectance = 0.02  # of water, Fresnel at normal incidence
 
-    def number(self) -> Floats:
+    def number(self) -> Float64Array:
         return np.asarray(8000 * np.exp(-4.1 * self.rate**-0.21 * DIAMETERS))
 
 
@@ -161,7 +159,7 @@ class Snow(Precipitation):
     SEVERE = {"rate": 1.5}, {"rate": 3.0}, {"rate": 7.5}
     reflectance = 0.9
 
-    def number(self) -> Floats:
+    def number(self) -> Float64Array:
         density = 3800 * self.rate**-0.87 / FLAKE
         slope = 2.55 * self.rate**-0.48 / FLAKE
         return np.asarray(density * np.exp(-slope * DIAMETERS))

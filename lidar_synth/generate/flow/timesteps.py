@@ -25,9 +25,9 @@ from tqdm import tqdm
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.flow.path import METRICS, Metric, Velocity
 from lidar_synth.generate.flow.solvers import trajectory, uniform_grid
+from lidar_synth.geometry.arrays import Int64Array
 from lidar_synth.noise import gaussian
 
-Integers = NDArray[np.int64]
 Costs = NDArray[np.float64]
 """(..., M + 1, M + 1) cost of one straight step from candidate i to candidate j > i; inf where j <=
 i."""
@@ -73,7 +73,7 @@ class TrajectoryCosts:
     """
 
     total: Costs
-    optima: Integers
+    optima: Int64Array
 
     @property
     def selection(self) -> Selection:
@@ -107,7 +107,7 @@ def sum_costs(
     condition: Callable[[range], Any] | None = None,
     progress: bool = True,
     done: TrajectoryCosts | None = None,
-    each: Callable[..., Iterator[tuple[Costs, Integers]]] = map,
+    each: Callable[..., Iterator[tuple[Costs, Int64Array]]] = map,
 ) -> Iterator[TrajectoryCosts]:
     """The costs of a selection, batch by batch: the last ones give the time grid of N steps on
     which a teacher's trajectories are straightest.
@@ -158,7 +158,7 @@ def sum_costs(
         total=trajectories, initial=count, desc="trajectories", disable=not progress
     )
 
-    def compute(first: int) -> tuple[Costs, Integers]:
+    def compute(first: int) -> tuple[Costs, Int64Array]:
         part = range(first, min(first + batch, trajectories))
         cond = condition(part) if condition else None
         with torch.inference_mode():
@@ -221,7 +221,7 @@ def cost_matrix(
     return costs.double().cpu().numpy()
 
 
-def best_path(costs: Costs, intervals: int) -> Integers:
+def best_path(costs: Costs, intervals: int) -> Int64Array:
     """The cheapest path of exactly N intervals through the candidates, by dynamic programming.
 
     Args:
@@ -243,6 +243,6 @@ def best_path(costs: Costs, intervals: int) -> Integers:
     return np.stack([np.zeros_like(path[0]), *reversed(path)], -1)
 
 
-def path_cost(costs: Costs, path: Integers) -> float:
+def path_cost(costs: Costs, path: Int64Array) -> float:
     """Total cost of a path (N + 1,) through one cost matrix."""
     return float(sum(costs[i, j] for i, j in pairwise(path)))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, TRAIN_ID, has_ground
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.geometry.layout.layout import (
     CLASSES,
     Layout,
@@ -16,8 +17,6 @@ from lidar_synth.geometry.layout.layout import (
 )
 from lidar_synth.geometry.overlap import overlapping_pairs
 from lidar_synth.geometry.scan import Boxes, Scan
-
-Floats = NDArray[np.float32]
 
 KINDS = {
     "building": ("building",),
@@ -98,7 +97,7 @@ def select_known_boxes(scan: Scan) -> Boxes:
     return boxes[[i for i in range(len(boxes)) if i not in dropped]]
 
 
-def _plane(points: Floats, name: str) -> tuple[float, float, float]:
+def _plane(points: Float32Array, name: str) -> tuple[float, float, float]:
     """The plane z = a + b x + c y through ground returns near the sensor, by repeated least
     squares."""
     near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR].astype(np.float64)
@@ -120,7 +119,7 @@ def _plane(points: Floats, name: str) -> tuple[float, float, float]:
     return float(plane[0]), float(plane[1]), float(plane[2])
 
 
-def _lowest(points: Floats) -> Floats:
+def _lowest(points: Float32Array) -> Float32Array:
     """The lowest return of each column of 1 m x 1 m, where it lies below the sensor."""
     below = points[points[:, 2] < -0.5]
     cell = np.floor(below[:, :2] / _SQUARE).astype(np.int64) @ (1 << 20, 1)
@@ -129,7 +128,7 @@ def _lowest(points: Floats) -> Floats:
     return below[order[first]]
 
 
-def _labelled(points: Floats, label: NDArray[np.uint8]) -> Iterator[Outline]:
+def _labelled(points: Float32Array, label: NDArray[np.uint8]) -> Iterator[Outline]:
     for kind, classes in KINDS.items():
         train_ids = [TRAIN_ID[name] for name in classes]
         for profile in _profiles(points[np.isin(label, train_ids)]):
@@ -149,7 +148,7 @@ def _unlabelled(scan: Scan, ground: tuple[float, float, float]) -> Iterator[Outl
         yield Outline(kind, profile[:, :2], profile[:, 2], profile[:, 3])
 
 
-def _profiles(points: Floats) -> Iterator[Floats]:
+def _profiles(points: Float32Array) -> Iterator[Float32Array]:
     """The first thing in each sector, connected to lines: (K, 5) x, y, lowest z, highest z, depth
     of its returns."""
     rho = np.hypot(points[:, 0], points[:, 1])
@@ -178,7 +177,7 @@ def _profiles(points: Floats) -> Iterator[Floats]:
     yield from _connected(np.array(rows, np.float64).reshape(-1, 5))
 
 
-def _find_run(rho: Floats) -> tuple[int, int]:
+def _find_run(rho: Float32Array) -> tuple[int, int]:
     """The first run of ascending distances without a gap that has enough of them; (0, 0) without
     one."""
     ends = np.append(np.flatnonzero(np.diff(rho) > _GAP) + 1, len(rho))
@@ -199,7 +198,7 @@ def _groups(sector: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
     )
 
 
-def _connected(rows: NDArray[np.float64]) -> Iterator[Floats]:
+def _connected(rows: NDArray[np.float64]) -> Iterator[Float32Array]:
     """Lines of neighbouring sectors with similar distance and edges; a sector alone is a line
     across it."""
     if not len(rows):
@@ -216,7 +215,7 @@ def _connected(rows: NDArray[np.float64]) -> Iterator[Floats]:
         yield _trace(line)
 
 
-def _trace(line: NDArray[np.float64]) -> Floats:
+def _trace(line: NDArray[np.float64]) -> Float32Array:
     """The line (K, 5) of ``_profiles`` of connected sectors (K - 2, 5)."""
     # Half a sector is added on both sides, so that lines of neighbouring sectors meet.
     edges = np.r_[line[0, 0], line[:, 0] + 0.5, line[-1, 0] + 1]

@@ -11,6 +11,7 @@ distant ones.
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.geometry.projection.kernels import (
     count_octants,
     decreases,
@@ -22,8 +23,6 @@ from lidar_synth.geometry.projection.kernels import (
     turns_of,
 )
 from lidar_synth.geometry.sensor import Sensor
-
-Floats = NDArray[np.float32]
 
 MIN_DECREASE = np.radians(2.0)
 """Smallest decrease of the azimuth at the start of a ring, radians."""
@@ -45,7 +44,7 @@ FRAGMENT = 0.05
 neighbouring ring."""
 
 
-def ring_bounds(points: Floats) -> NDArray[np.int64]:
+def ring_bounds(points: Float32Array) -> NDArray[np.int64]:
     """(R + 1,) the first point of each ring, and N, for a scan of N points in raw ring order or a
     crop of one."""
     starts = np.empty(0, np.int64)
@@ -56,7 +55,7 @@ def ring_bounds(points: Floats) -> NDArray[np.int64]:
     return np.concatenate([[0], starts, [len(points)]]).astype(np.int64)
 
 
-def fault_of(points: Floats, bounds: NDArray[np.int64], lasers: Sensor) -> str:
+def fault_of(points: Float32Array, bounds: NDArray[np.int64], lasers: Sensor) -> str:
     """Why the rings from ``ring_bounds`` cannot be those of a sensor, as a text; "" if they can.
 
     Args:
@@ -113,8 +112,8 @@ def fault_of(points: Floats, bounds: NDArray[np.int64], lasers: Sensor) -> str:
 
 
 def turns(
-    points: Floats,
-) -> tuple[Floats, Floats]:
+    points: Float32Array,
+) -> tuple[Float32Array, Float32Array]:
     """(N,) radians counter-clockwise from straight ahead, in [0, 2 pi], and (N,) horizontal
     distance, metres."""
     azimuth = np.empty(len(points), np.float32)
@@ -123,14 +122,14 @@ def turns(
     return azimuth, flat
 
 
-def _all_around(points: Floats) -> bool:
+def _all_around(points: Float32Array) -> bool:
     """Whether each of eight sectors of azimuth contains more than 1 % of the points."""
     counts = np.zeros(8, np.int64)
     count_octants(points, counts)
     return bool(counts.min() > 0.01 * len(points))
 
 
-def _elevations(points: Floats) -> NDArray[np.float64]:
+def _elevations(points: Float32Array) -> NDArray[np.float64]:
     """(N,) radians above the horizon of points (N, 3)."""
     elevation: NDArray[np.float64] = np.arctan2(
         points[:, 2].astype(np.float64), np.hypot(points[:, 0], points[:, 1])
@@ -138,7 +137,7 @@ def _elevations(points: Floats) -> NDArray[np.float64]:
     return elevation
 
 
-def _start_candidates(points: Floats) -> list[NDArray[np.intp]]:
+def _start_candidates(points: Float32Array) -> list[NDArray[np.intp]]:
     """Candidates for the starts of rings, grouped: candidates at most ``STRAYS`` points apart are
     one start."""
     azimuth, flat = turns(points)
@@ -160,7 +159,7 @@ def _start_candidates(points: Floats) -> list[NDArray[np.intp]]:
     return np.split(candidates, np.flatnonzero(np.diff(candidates) > STRAYS) + 1)
 
 
-def _best_candidate(group: NDArray[np.intp], points: Floats) -> int:
+def _best_candidate(group: NDArray[np.intp], points: Float32Array) -> int:
     """The candidate of a group that minimises the spread of the elevations on its two sides."""
     if len(group) == 1:
         return int(group[0])
@@ -175,7 +174,9 @@ def _best_candidate(group: NDArray[np.intp], points: Floats) -> int:
     return int(min(group.tolist(), key=spread))
 
 
-def _without_fragments(starts: NDArray[np.intp], points: Floats) -> NDArray[np.intp]:
+def _without_fragments(
+    starts: NDArray[np.intp], points: Float32Array
+) -> NDArray[np.intp]:
     """The starts of rings without those that only cut a fragment off a ring."""
     length = np.diff(np.concatenate([[0], starts, [len(points)]]))
     short = np.flatnonzero(length < FRAGMENT * np.median(length))
@@ -196,7 +197,7 @@ def _without_fragments(starts: NDArray[np.intp], points: Floats) -> NDArray[np.i
     )
 
 
-def _height(points: Floats, bounds: NDArray[np.int64]) -> float:
+def _height(points: Float32Array, bounds: NDArray[np.int64]) -> float:
     """The height of the lasers above the points' origin, metres, from pairs of near and distant
     neighbouring points.
 

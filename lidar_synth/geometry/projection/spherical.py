@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.geometry.projection.kernels import (
     Grid,
     along_rays,
@@ -33,8 +34,6 @@ from lidar_synth.geometry.scan import (
 )
 from lidar_synth.geometry.sensor import Rays, Sensor
 
-Floats = NDArray[np.float32]
-
 
 class Cells(NamedTuple):
     """The cell of each point, and the point that each cell shows.
@@ -46,11 +45,11 @@ class Cells(NamedTuple):
     """
 
     cell: NDArray[np.int32]
-    range: Floats
+    range: Float32Array
     point: NDArray[np.int32]
 
 
-def locate(points: Floats, sensor: Sensor) -> Cells:
+def locate(points: Float32Array, sensor: Sensor) -> Cells:
     """Find the cell of each point on a sensor's grid, and the point that each cell shows.
 
     Args:
@@ -75,7 +74,9 @@ def locate(points: Floats, sensor: Sensor) -> Cells:
     return Cells(cell, distance, nearest_in(cell, distance, sensor)[1])
 
 
-def cells_of(points: Floats, grid: Grid) -> tuple[NDArray[np.int32], Floats]:
+def cells_of(
+    points: Float32Array, grid: Grid
+) -> tuple[NDArray[np.int32], Float32Array]:
     """Cell (N,) and range (N,) of each point; see ``locate``."""
     points = _checked(points)
     cell = np.empty(len(points), np.int32)
@@ -85,8 +86,8 @@ def cells_of(points: Floats, grid: Grid) -> tuple[NDArray[np.int32], Floats]:
 
 
 def nearest_in(
-    cell: NDArray[np.int32], distance: Floats, sensor: Sensor
-) -> tuple[Floats, NDArray[np.int32]]:
+    cell: NDArray[np.int32], distance: Float32Array, sensor: Sensor
+) -> tuple[Float32Array, NDArray[np.int32]]:
     """Range (H, W) and index (H, W) of the nearest point in each cell; of points at equal range,
     the first.
 
@@ -219,7 +220,7 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
     return Scan(points[:count], sensor=image.sensor, boxes=image.boxes, **fields)
 
 
-def _checked(points: NDArray[Any]) -> Floats:
+def _checked(points: NDArray[Any]) -> Float32Array:
     if points.dtype != np.float32 or points.ndim != 2 or points.shape[1] < 3:
         raise DataError(
             f"points of shape {points.shape}, {points.dtype}",

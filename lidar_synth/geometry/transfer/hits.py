@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lidar_synth.geometry.arrays import Float64Array
 
 _inlined = numba.njit(cache=True, nogil=True, inline="always")
 
@@ -35,9 +35,9 @@ class Vertices(NamedTuple):
         value: (N,) is interpolated between them.
     """
 
-    points: Floats
-    azimuth: Floats
-    rho: Floats
+    points: Float64Array
+    azimuth: Float64Array
+    rho: Float64Array
     rows: NDArray[np.int32]
     value: NDArray[np.float32]
 
@@ -56,8 +56,8 @@ class FootprintShape(NamedTuple):
     recorded: NDArray[np.float32]
     level: NDArray[np.bool_]
     half: float
-    up: Floats
-    down: Floats
+    up: Float64Array
+    down: Float64Array
 
 
 class Nearest(NamedTuple):
@@ -70,7 +70,7 @@ class Nearest(NamedTuple):
         facing: (H, F) cosine of the angle between the ray and the normal.
     """
 
-    rho: Floats
+    rho: Float64Array
     vertex: NDArray[np.int32]
     value: NDArray[np.float32]
     facing: NDArray[np.float32]

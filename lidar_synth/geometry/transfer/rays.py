@@ -4,11 +4,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.sensor import Sensor
-
-Floats = NDArray[np.float64]
 
 
 class Rays(NamedTuple):
@@ -24,18 +22,18 @@ class Rays(NamedTuple):
         directions: (H, F, 2) x and y of each ray's direction, per unit of horizontal distance.
     """
 
-    slope: Floats
-    height: Floats
-    first: Floats
+    slope: Float64Array
+    height: Float64Array
+    first: Float64Array
     step: float
     firings: int
-    directions: Floats
+    directions: Float64Array
 
 
 def rays_from(
-    slope: Floats,
-    height: Floats,
-    first: Floats,
+    slope: Float64Array,
+    height: Float64Array,
+    first: Float64Array,
     firings: int,
 ) -> Rays:
     """The rays of H lasers (H,) with F firings each, see ``Rays``."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.arrays import Int64Array
 from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.projection.kernels import medians, sines_of
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds, turns
@@ -19,8 +20,6 @@ from lidar_synth.geometry.transfer.kernels import (
     neighbours_below,
     triangulate,
 )
-
-Integers = NDArray[np.int64]
 
 ORDERED = np.radians(2.0)
 """Radians; a file may be in ring order if more than half of the steps of azimuth between successive
@@ -130,7 +129,7 @@ def estimate(scan: Scan) -> ScanSurfaces:
     return ScanSurfaces(scan, azimuth, triangles, rim, level, step, up, down, bounds)
 
 
-def rings_of(scan: Scan) -> tuple[Integers, bool]:
+def rings_of(scan: Scan) -> tuple[Int64Array, bool]:
     """(N,) ring of each return, 0 = highest, and whether rings are rows of a grid, which may lack
     returns of a row.
 
@@ -190,12 +189,12 @@ def _elevations(scan: Scan) -> NDArray[np.float32]:
     return np.arcsin(np.clip(sine, -1, 1))
 
 
-def _row(elevation: NDArray[np.float32], sensor: Sensor) -> Integers:
+def _row(elevation: NDArray[np.float32], sensor: Sensor) -> Int64Array:
     """(N,) row of a sensor's grid at each elevation (N,), radians."""
     return np.searchsorted(-sensor.edges[1:-1], -elevation)
 
 
-def _rows_of(scan: Scan) -> Integers:
+def _rows_of(scan: Scan) -> Int64Array:
     """(N,) row of each return; of those outside the sensor's range limits too."""
     endless = replace(scan.sensor, range_min=0.0, range_max=1e6)
     cell = locate(scan.points.astype(np.float32), endless).cell
@@ -214,7 +213,7 @@ def _check(scan: Scan) -> None:
 def _check_rings(
     scan: Scan,
     elevation: NDArray[np.float32],
-    starts: Integers,
+    starts: Int64Array,
     middle: NDArray[np.float64],
 ) -> None:
     """Refuse points that do not lie on rings, such as those of a map."""
@@ -231,7 +230,7 @@ def _check_rings(
         )
 
 
-def _step(azimuth: NDArray[np.float64], starts: Integers, sensor: Sensor) -> float:
+def _step(azimuth: NDArray[np.float64], starts: Int64Array, sensor: Sensor) -> float:
     """Radians between two firings: the sensor's own, or the lower quartile between neighbours along
     a ring."""
     if sensor.firings is not None:
@@ -243,7 +242,7 @@ def _step(azimuth: NDArray[np.float64], starts: Integers, sensor: Sensor) -> flo
     return float(min(np.percentile(turn, 25) if len(turn) else nominal, 1.5 * nominal))
 
 
-def _objects(scan: Scan) -> Integers:
+def _objects(scan: Scan) -> Int64Array:
     """(N,) a number for each pair of label and instance."""
     key: Any = np.zeros(len(scan), np.int64)
     if scan.label is not None:

@@ -21,10 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from lidar_synth.geometry.arrays import Float64Array, Int64Array
 from lidar_synth.noise import keyed_rng
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 DIMENSIONS = 64
 """Dimensions of a sketch."""
@@ -72,7 +70,7 @@ class Signatures(Protocol):
 
 def find_similar(
     signatures: Signatures, progress: bool = True
-) -> tuple[Floats, Integers]:
+) -> tuple[Float64Array, Int64Array]:
     """For each signature, approximately the most similar earlier one; like ``most_similar``.
 
     Returns:
@@ -108,7 +106,7 @@ def _parts(count: int, size: int | None = None) -> Iterator[slice]:
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
-def _first_copies(signatures: Signatures) -> Integers:
+def _first_copies(signatures: Signatures) -> Int64Array:
     """(N,) number of the first signature with the same bytes."""
     hashes = np.empty(len(signatures), np.uint64)
     for part in _parts(len(signatures)):
@@ -123,14 +121,14 @@ def _first_copies(signatures: Signatures) -> Integers:
     return first[group]
 
 
-def _sketches(signatures: Signatures, own: Integers) -> NDArray[np.int8]:
+def _sketches(signatures: Signatures, own: Int64Array) -> NDArray[np.int8]:
     """(len(own), DIMENSIONS) the sketches of some signatures."""
     width = signatures[:1].shape[1]
     signs = keyed_rng(width, DIMENSIONS).choice(
         np.array([-1, 1], np.float32), (width, DIMENSIONS)
     )
 
-    def project(rows: Integers) -> NDArray[np.float32]:
+    def project(rows: Int64Array) -> NDArray[np.float32]:
         values: NDArray[np.float32] = (
             np.rint(signatures[rows].astype(np.float32) * _STEPS) @ signs
         )
@@ -182,7 +180,9 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32
     return best.astype(np.int32)
 
 
-def _by_cell(of: NDArray[np.unsignedinteger], cells: int) -> tuple[Integers, Integers]:
+def _by_cell(
+    of: NDArray[np.unsignedinteger], cells: int
+) -> tuple[Int64Array, Int64Array]:
     """Numbers of the sketches, sorted by cell and then ascending; start of each cell in this list,
     and its end."""
     order = np.argsort(of, kind="stable")
@@ -191,9 +191,9 @@ def _by_cell(of: NDArray[np.unsignedinteger], cells: int) -> tuple[Integers, Int
 
 def _compare(
     sketches: NDArray[np.int8],
-    queries: Integers,
-    members: Integers,
-    best: Floats,
+    queries: Int64Array,
+    members: Int64Array,
+    best: Float64Array,
 ) -> None:
     """Update the best candidates of each query with the earlier members of a cell."""
     keys = _keys(sketches[queries], sketches[members], members)
@@ -204,8 +204,8 @@ def _compare(
 
 
 def _keys(
-    some: NDArray[np.int8], others: NDArray[np.int8], numbers: Integers
-) -> Floats:
+    some: NDArray[np.int8], others: NDArray[np.int8], numbers: Int64Array
+) -> Float64Array:
     """(M, N) sort keys: the squared distance of two sketches first, then the number of the second
     sketch."""
     a = some.astype(np.float32)
@@ -213,13 +213,13 @@ def _keys(
     own = (a * a).sum(1)
     theirs = (b * b).sum(1)
     distances = own[:, None] + theirs - 2 * (a @ b.T)  # whole numbers below 2^22
-    keys: Floats = distances.astype(np.float64) * _NUMBERS + numbers
+    keys: Float64Array = distances.astype(np.float64) * _NUMBERS + numbers
     return keys
 
 
 def _best(
-    signatures: Signatures, part: slice, found: Integers
-) -> tuple[Floats, Integers]:
+    signatures: Signatures, part: slice, found: Int64Array
+) -> tuple[Float64Array, Int64Array]:
     """Similarity and number of the most similar of the candidates (M, K) of each signature; the
     first one of equals."""
     found = np.sort(found, 1)

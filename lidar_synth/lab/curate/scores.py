@@ -23,13 +23,12 @@ from lidar_synth.files.disk import write_arrays
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.files.processes import map_in_processes
 from lidar_synth.geometry import Sensor, Source
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.projection import project
 from lidar_synth.lab.curate.duplicates import most_similar
 from lidar_synth.lab.curate.features import MEASURES, RANGE_BINS, features
 from lidar_synth.lab.curate.store import Store, measure
 from lidar_synth.lab.evaluate import jensen_shannon_distance
-
-Floats = NDArray[np.float64]
 
 FILE = "scores.npz"
 """Name of the file, in the bank's folder."""
@@ -65,7 +64,7 @@ class Scores:
 
     bank: str
     reference: str
-    values: dict[str, Floats]
+    values: dict[str, Float64Array]
     twin: NDArray[np.int64]
 
 
@@ -170,7 +169,7 @@ class _Mean:
             self._count += 1
 
     @property
-    def value(self) -> Floats:
+    def value(self) -> Float64Array:
         return self._total / max(self._count, 1)
 
 
@@ -208,7 +207,7 @@ def _of_source(source: Source, sensor: Sensor, number: int) -> Histograms:
     return found.ranges, found.classes
 
 
-def _distances(store: Store, key: str, mean: Floats) -> Floats:
+def _distances(store: Store, key: str, mean: Float64Array) -> Float64Array:
     """(N,) Jensen-Shannon distance of each scan's histogram to a mean histogram."""
     known = mean.any()
     found = (

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import rel_entr
 
 from lidar_synth.errors import DataError
-
-Floats = NDArray[np.float64]
+from lidar_synth.geometry.arrays import Float64Array
 
 
 def jensen_shannon_distance(p: NDArray[np.number], q: NDArray[np.number]) -> float:
@@ -59,10 +58,10 @@ def frechet_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
 
 
 def frechet_of_moments(
-    mean_a: Floats,
-    cov_a: Floats,
-    mean_b: Floats,
-    cov_b: Floats,
+    mean_a: Float64Array,
+    cov_a: Float64Array,
+    mean_b: Float64Array,
+    cov_b: Float64Array,
 ) -> float:
     """As ``frechet_distance``, from means (D,) and covariances (D, D)."""
     values, vectors = np.linalg.eigh(cov_a)
@@ -120,7 +119,7 @@ def squared_mmd(
 
 def checked_features(
     a: NDArray[np.floating], b: NDArray[np.floating]
-) -> tuple[Floats, Floats]:
+) -> tuple[Float64Array, Float64Array]:
     """(N, D) and (M, D) features in float64.
 
     Raises:

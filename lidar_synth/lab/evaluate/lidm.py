@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Sensor
-
-Floats = NDArray[np.float32]
+from lidar_synth.geometry.arrays import Float32Array
 
 HALF = 50
 """Half the side of the bird's-eye square around the sensor, metres."""
@@ -30,7 +29,7 @@ SENSOR = Sensor(
 """The grid of LiDM's range images."""
 
 
-def find_occupied(points: Floats, size: float) -> NDArray[np.int32]:
+def find_occupied(points: Float32Array, size: float) -> NDArray[np.int32]:
     """The cells of ``size`` metres that hold a point, as row * cells per side + column, sorted: row
     along x.
 
@@ -64,7 +63,7 @@ def matching_distances(
     real: Sequence[NDArray[np.int32]],
     generated: Sequence[NDArray[np.int32]],
     size: float,
-) -> Floats:
+) -> Float32Array:
     """(N, M) Chamfer distance of every real cloud and every generated one.
 
     The Chamfer distance of two clouds is the mean of both mean squared distances between nearest
@@ -87,10 +86,10 @@ def matching_distances(
 
 @numba.njit(cache=True, nogil=True)
 def _add_means(
-    values: Floats,
+    values: Float32Array,
     cells: NDArray[np.int32],
     starts: NDArray[np.int64],
-    out: Floats,
+    out: Float32Array,
 ) -> None:
     """Add to ``out`` the mean value over the cells of each cloud."""
     for k in range(len(starts) - 1):
@@ -101,7 +100,7 @@ def _add_means(
 
 
 @numba.njit(cache=True, nogil=True)
-def _distance_map(cells: NDArray[np.int32], side: int) -> Floats:
+def _distance_map(cells: NDArray[np.int32], side: int) -> Float32Array:
     """(side, side) exact squared distances: along one axis, then the lower envelope of parabolas
     along the other (Felzenszwalb and Huttenlocher, Theory of Computing 2012)."""
     gaps = np.full((side, side), 4 * side, np.int32)

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lidar_synth.datasets.classes import LABELS
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Scan, Source
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.labels.objects import Object, instances_of, objects_of
-
-Floats = NDArray[np.float64]
 
 CLASSES = {"car": LABELS["Car"], "person": LABELS["Pedestrian"]}
 """Train ids of the judged classes."""
@@ -66,7 +64,7 @@ class Crop:
     roof: float
     side: float
     rough: float
-    features: Mapping[str, Floats]
+    features: Mapping[str, Float64Array]
 
 
 def crop(found: Object, place: str) -> Crop:
@@ -103,13 +101,13 @@ def crop(found: Object, place: str) -> Crop:
     return Crop(place, distance, width, count, roof, side, rough, features)
 
 
-def _median(values: Floats) -> float:
+def _median(values: Float64Array) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
 def _surfaces(
-    points: Floats,
-) -> tuple[Floats, Floats]:
+    points: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
     """(N,) how upright the normal of the neighbours of each point is, 0 to 1; (N,) distance of the
     point from their plane, metres."""
     _, near = KDTree(points).query(points, min(NEIGHBOURS, len(points)))
@@ -173,7 +171,7 @@ def match(real: Sequence[Crop], fake: Sequence[Crop]) -> list[tuple[Crop, Crop]]
     return matched
 
 
-def _seen(side: Sequence[Crop]) -> Floats:
+def _seen(side: Sequence[Crop]) -> Float64Array:
     return np.array([(np.log(c.distance) / NEAR, c.width / WIDE) for c in side])
 
 
@@ -202,7 +200,7 @@ def separate(
     return float(np.average(areas, weights=weights)) if areas else None
 
 
-def _area(known: Floats, asked: Floats) -> float:
+def _area(known: Float64Array, asked: Float64Array) -> float:
     """The area under the ROC curve at pairs (2 M, D) of a classifier that knows (2 N, D): ridge
     regression of the side on the features and their squares."""
     mean = known.mean(0)
@@ -218,12 +216,12 @@ def _area(known: Floats, asked: Floats) -> float:
     return float(((above > 0) + (above == 0) / 2).mean())
 
 
-def _with_squares(rows: Floats) -> Floats:
+def _with_squares(rows: Float64Array) -> Float64Array:
     rows = np.clip(rows, -FARTHEST, FARTHEST)
     return np.concatenate([rows, rows**2], 1)
 
 
-def _rows(pairs: Sequence[tuple[Crop, Crop]], groups: Sequence[str]) -> Floats:
+def _rows(pairs: Sequence[tuple[Crop, Crop]], groups: Sequence[str]) -> Float64Array:
     """(2 N, D) features of the first objects, then of the second ones."""
     crops = [pair[side].features for side in (0, 1) for pair in pairs]
     return np.array([np.concatenate([c[name] for name in groups]) for c in crops])

@@ -24,11 +24,10 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_file, write_file
 from lidar_synth.geometry import Scan, Sensor
+from lidar_synth.geometry.arrays import Int64Array
 from lidar_synth.geometry.projection import project
 from lidar_synth.lab.evaluate.labels import require_label
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
-
-Integers = NDArray[np.int64]
 
 FORMAT = "lidar-synth-segmenter/1"
 
@@ -39,7 +38,7 @@ Images = Mapping[str, Tensor]
 
 def confusion(
     network: nn.Module, batches: Iterable[Images], height: Tensor
-) -> Integers:
+) -> Int64Array:
     """(19, 19) number of cells by label (row) and prediction (column), without ignored cells."""
     table = np.zeros((len(NAMES), len(NAMES)), np.int64)
     with torch.inference_mode():
@@ -54,7 +53,7 @@ def tabulate(
     label: NDArray[np.uint8],
     predicted: NDArray[np.integer],
     columns: int = len(NAMES),
-) -> Integers:
+) -> Int64Array:
     """(19, columns) number of elements by label (row) and prediction (column), without ignored
     ones; the arrays have one shape."""
     valid = label != IGNORE
@@ -63,7 +62,7 @@ def tabulate(
     return counts.reshape(len(NAMES), columns)
 
 
-def class_ious(table: Integers) -> NDArray[np.float64]:
+def class_ious(table: Int64Array) -> NDArray[np.float64]:
     """(19,) intersection over union of every class; NaN for a class that is neither labelled nor
     predicted.
 
@@ -75,7 +74,7 @@ def class_ious(table: Integers) -> NDArray[np.float64]:
     return np.where(union > 0, hit / np.maximum(union, 1), np.nan)
 
 
-def mean_iou(table: Integers) -> float:
+def mean_iou(table: Int64Array) -> float:
     """Mean of ``class_ious`` over the classes that occur in the labels, in [0, 1].
 
     Raises:
@@ -115,7 +114,7 @@ class Judge:
             inputs = segmenter_input(batch["range"], batch["reflectance"], self.height)
             return self.network.features(inputs).double().numpy()
 
-    def agreement(self, scans: Iterable[Scan]) -> Integers:
+    def agreement(self, scans: Iterable[Scan]) -> Int64Array:
         """(19, 19) number of cells by the scans' labels (row) and the network's prediction
         (column).
 

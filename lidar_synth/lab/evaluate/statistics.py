@@ -13,13 +13,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.evaluate.distances import (
     checked_features,
     frechet_of_moments,
     jensen_shannon_distance,
 )
 
-Floats = NDArray[np.float64]
 Counts = NDArray[np.integer[Any]]
 
 _BLOCK = 1000  # samples compared with one another at a time: 4 MB of kernel values in float32
@@ -34,7 +34,7 @@ class Statistic(NamedTuple):
         sizes: (N, M).
     """
 
-    at: Callable[[Counts, Counts], Floats]
+    at: Callable[[Counts, Counts], Float64Array]
     sizes: tuple[int, int]
 
     @property
@@ -73,7 +73,7 @@ def sparse_histogram_distance(
     place = np.cumsum(filled, dtype=np.int32) - 1
     used = int(filled.sum())
 
-    def at(a: Counts, b: Counts) -> Floats:
+    def at(a: Counts, b: Counts) -> Float64Array:
         sums = (
             (_sum(real, p, place, used), _sum(fake, q, place, used))
             for p, q in zip(a, b, strict=True)
@@ -138,7 +138,7 @@ def gaussian_mmd(
         squared = own[:, None] + q.square().sum(1) - 2 * p @ q.T
         return torch.expm1(-2 * squared.clamp_(min=0))
 
-    def at(a: Counts, b: Counts) -> Floats:
+    def at(a: Counts, b: Counts) -> Float64Array:
         mean = [
             _mean_kernel(less_one, *pair, block)
             for pair in ((real, a, real, a), (fake, b, fake, b), (real, a, fake, b))
@@ -155,7 +155,7 @@ def _mean_kernel(
     q: Rows,
     b: Counts,
     size: int,
-) -> Floats:
+) -> Float64Array:
     """(R,) mean of the kernel over all pairs, by the counts (R, N) and (R, M); ``size`` samples at
     a time."""
     left, right = (torch.from_numpy(np.asarray(c, np.float32)) for c in (a, b))
@@ -188,7 +188,7 @@ def frechet(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Statistic
     """
     sets = checked_features(real, fake)
 
-    def at(a: Counts, b: Counts) -> Floats:
+    def at(a: Counts, b: Counts) -> Float64Array:
         return np.array(
             [
                 frechet_of_moments(*_moments(sets[0], p), *_moments(sets[1], q))
@@ -199,7 +199,9 @@ def frechet(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Statistic
     return Statistic(at, (len(sets[0]), len(sets[1])))
 
 
-def _moments(features: Floats, counts: Counts) -> tuple[Floats, Floats]:
+def _moments(
+    features: Float64Array, counts: Counts
+) -> tuple[Float64Array, Float64Array]:
     kept = counts > 0
     features = features[kept]
     counts = counts[kept]
@@ -226,7 +228,7 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
     def kernel(p: Tensor, q: Tensor) -> Tensor:
         return (p @ q.T / x.shape[1] + 1) ** 3
 
-    def within(k: int, counts: Counts) -> Floats:
+    def within(k: int, counts: Counts) -> Float64Array:
         pairs = counts.sum(1).astype(np.float64) ** 2
         own = counts.astype(np.float64) ** 2
         total = (
@@ -237,7 +239,7 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(total / (pairs - own.sum(1)))
 
-    def at(a: Counts, b: Counts) -> Floats:
+    def at(a: Counts, b: Counts) -> Float64Array:
         return (
             within(0, a)
             + within(1, b)
@@ -255,7 +257,7 @@ def smallest_of_pairs(distances: NDArray[np.floating]) -> Statistic:
         distances: (N, M) of every pair.
     """
 
-    def at(a: Counts, b: Counts) -> Floats:
+    def at(a: Counts, b: Counts) -> Float64Array:
         values = []
         for p, q in zip(a, b, strict=True):
             nearest = distances[:, q > 0].min(1).astype(np.float64)
@@ -276,7 +278,7 @@ def share(hits: NDArray[np.floating], of_real: bool, other: int) -> Statistic:
         other: number of samples of the other set.
     """
 
-    def at(a: Counts, b: Counts) -> Floats:
+    def at(a: Counts, b: Counts) -> Float64Array:
         counts = a if of_real else b
         return np.asarray(counts @ hits / counts.sum(1))
 

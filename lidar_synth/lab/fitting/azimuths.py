@@ -11,10 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from lidar_synth.geometry.arrays import Float64Array, Int64Array
 
 FAR = 4.0
 """Metres; nearer points are left out where the time gives the offsets."""
@@ -64,10 +62,10 @@ class Azimuths:
 
     firings: int | None = None
     lattice: int | None = None
-    offsets: Floats | None = None
+    offsets: Float64Array | None = None
     known: str = ""
     spread: float = 0.0
-    sides: Floats | None = None
+    sides: Float64Array | None = None
 
 
 @dataclass(frozen=True)
@@ -75,13 +73,13 @@ class Turn:
     """One scan in the sensor's frame: (N,) azimuth in turns (clockwise), distance from the axis,
     beam, time or None."""
 
-    azimuth: Floats
-    rho: Floats
-    ring: Integers
-    time: Floats | None
+    azimuth: Float64Array
+    rho: Float64Array
+    ring: Int64Array
+    time: Float64Array | None
 
 
-def turn_of(points: Floats, ring: Integers, time: Floats | None) -> Turn:
+def turn_of(points: Float64Array, ring: Int64Array, time: Float64Array | None) -> Turn:
     """A scan as azimuths.
 
     Args:
@@ -136,14 +134,14 @@ def fit_azimuths(turns: list[Turn], beams: int) -> Azimuths:
     return Azimuths(count, size, *_combined(by_scan, beams, "encoder"), sides)
 
 
-def _wrap(turns: Floats) -> Floats:
+def _wrap(turns: Float64Array) -> Float64Array:
     """The same fraction of a period in [-0.5, 0.5)."""
     return np.asarray((turns + 0.5) % 1.0 - 0.5)
 
 
 def _combined(
-    by_scan: Floats, beams: int, known: str, period: float = 360.0
-) -> tuple[Floats | None, str, float]:
+    by_scan: Float64Array, beams: int, known: str, period: float = 360.0
+) -> tuple[Float64Array | None, str, float]:
     """Offsets (B,) as the median over scans (S, B), how they are known, and the median
     disagreement.
 
@@ -182,7 +180,7 @@ def _firings(turn: Turn, beams: int) -> float:
     return float(np.median([1 / step.mean() for step in single]))
 
 
-def _measure_powers(turn: Turn, beams: int) -> Iterator[Floats]:
+def _measure_powers(turn: Turn, beams: int) -> Iterator[Float64Array]:
     """The power spectrum of the azimuths of each beam with enough distant points."""
     for beam in range(beams):
         own = turn.azimuth[(turn.ring == beam) & (turn.rho > DISTANT)]
@@ -208,7 +206,7 @@ def _lattice(turn: Turn, beams: int, firings: float) -> tuple[float, int]:
     return best, first + int(near[np.argmax(coherence[near])])
 
 
-def _sides(turn: Turn, beams: int, lattice: int) -> Floats:
+def _sides(turn: Turn, beams: int, lattice: int) -> Float64Array:
     """(B,) lateral offset of each laser, metres, that makes its azimuths most coherent."""
     sides = np.zeros(beams)
     for beam in range(beams):
@@ -226,7 +224,7 @@ def _sides(turn: Turn, beams: int, lattice: int) -> Floats:
     return sides
 
 
-def _phases(turn: Turn, beams: int, lattice: int, sides: Floats) -> Floats:
+def _phases(turn: Turn, beams: int, lattice: int, sides: Float64Array) -> Float64Array:
     """(B,) the part of a lattice step by which each beam's azimuths differ from whole steps, in
     [-0.5, 0.5)."""
     seen = turn.azimuth + sides[turn.ring] / (2 * np.pi * turn.rho)
@@ -242,9 +240,9 @@ def _by_pattern(
     turn: Turn,
     beams: int,
     lattice: int,
-    sides: Floats,
-    phases: Floats,
-) -> Floats:
+    sides: Float64Array,
+    phases: Float64Array,
+) -> Float64Array:
     """(B,) degrees: offsets that align the patterns of skipped encoder steps; their median is 0."""
     seen = turn.azimuth + sides[turn.ring] / (2 * np.pi * turn.rho)
     step = (
@@ -270,7 +268,7 @@ def _by_pattern(
     return np.asarray(offsets - np.nanmedian(offsets))
 
 
-def _offsets_by_time(turn: Turn, beams: int) -> Floats:
+def _offsets_by_time(turn: Turn, beams: int) -> Float64Array:
     """(B,) degrees beyond the azimuth of the turning head, which is a smooth function of time;
     their median is 0."""
     assert turn.time is not None

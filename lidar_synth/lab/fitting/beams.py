@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidar_synth.geometry import Scan
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.lines import nearest_beams, residuals
 from lidar_synth.lab.fitting.model import CAP, Cloud, Model, refine
 from lidar_synth.lab.fitting.peaks import beam_peaks
@@ -16,7 +16,6 @@ from lidar_synth.lab.fitting.search import REACH, find_motion, find_mount
 
 log = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
 
 POINTS = 120_000
 """Number of points that a fit uses; a choice between models uses a third of them."""
@@ -215,7 +214,7 @@ def quality_of(model: Model, cloud: Cloud) -> float:
     return float((np.abs(residual) < room_of(model.tangents)[cloud.ring] / 4).mean())
 
 
-def room_of(tangents: Floats) -> Floats:
+def room_of(tangents: Float64Array) -> Float64Array:
     """(B,) angle from each beam to the next one, the nearer of the two, radians."""
     order = np.argsort(tangents)
     gap = np.diff(np.arctan(tangents[order]))
@@ -306,7 +305,7 @@ def add_peaks(cloud: Cloud, model: Model) -> Model | None:
     return replace(model, tangents=np.tan(best), heights=model.heights[nearest])
 
 
-def concentration(elevation: Floats, beams: Floats) -> float:
+def concentration(elevation: Float64Array, beams: Float64Array) -> float:
     """Share of points in the middle half between the borders of their beams, 0.5 for points
     anywhere; 0 for no beams.
 

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.geometry import presets
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.fitting.azimuths import FAR, FEW, FEWEST, Azimuths
-
-Floats = NDArray[np.float64]
 
 FEW_POINTS = 50
 """A beam needs as many points to be certain."""
@@ -31,9 +30,9 @@ MOST_MISSING = 0.5
 
 
 def doubts(
-    elevations: Floats,
+    elevations: Float64Array,
     points: NDArray[np.int64],
-    within: Floats,
+    within: Float64Array,
     near: float,
     known: Azimuths,
 ) -> list[str]:
@@ -66,11 +65,11 @@ def doubts(
     return found + _of_azimuths(elevations, known)
 
 
-def _listed(values: Floats) -> str:
+def _listed(values: Float64Array) -> str:
     return ", ".join(f"{value:.2f}" for value in values)
 
 
-def _of_azimuths(elevations: Floats, known: Azimuths) -> list[str]:
+def _of_azimuths(elevations: Float64Array, known: Azimuths) -> list[str]:
     found = []
     if known.firings is None:
         found.append(
@@ -104,7 +103,7 @@ def _of_azimuths(elevations: Floats, known: Azimuths) -> list[str]:
 
 
 @lru_cache(maxsize=1)
-def vendors() -> dict[str, Floats]:
+def vendors() -> dict[str, Float64Array]:
     """{name: (B,) elevations in degrees, highest first} of the sensors in ``vendors.yaml``."""
     text = (
         files("lidar_synth.geometry")
@@ -115,7 +114,7 @@ def vendors() -> dict[str, Floats]:
     return {name: _elevations(table) for name, table in tables.items()}
 
 
-def _elevations(table: Any) -> Floats:
+def _elevations(table: Any) -> Float64Array:
     """An entry of ``vendors.yaml`` as a table."""
     if isinstance(table, dict):
         return np.linspace(*table["evenly"])
@@ -124,7 +123,7 @@ def _elevations(table: Any) -> Floats:
     )
 
 
-def name_vendor(elevations: Floats, points: NDArray[np.int64]) -> str:
+def name_vendor(elevations: Float64Array, points: NDArray[np.int64]) -> str:
     """The vendors' sensor with these beams and the fewest others, and how many it has that are
     missing; "" if none.
 

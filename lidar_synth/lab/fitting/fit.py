@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Scan, Sensor, Source, spread
+from lidar_synth.geometry.arrays import Float64Array, Int64Array
 from lidar_synth.geometry.lines import nearest_beams, residuals
 from lidar_synth.lab.fitting.azimuths import Azimuths, fit_azimuths, turn_of
 from lidar_synth.lab.fitting.beams import NEAREST, Beams, fit_beams, room_of
@@ -17,9 +18,6 @@ from lidar_synth.lab.fitting.limits import range_limits, range_step, reflectance
 from lidar_synth.lab.fitting.lost_beams import add_lost_beams
 from lidar_synth.lab.fitting.model import Cloud, Model
 from lidar_synth.lab.fitting.points import follows_time
-
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 SCANS = 20
 """Largest number of scans that a fit uses, evenly spaced among those given."""
@@ -80,11 +78,11 @@ class SensorFit:
     """
 
     sensor: Sensor
-    points: Integers
-    spread: Floats
-    within: Floats
-    mount: Floats
-    motion: Floats
+    points: Int64Array
+    spread: Float64Array
+    within: Float64Array
+    mount: Float64Array
+    motion: Float64Array
     source: str
     nearest: float
     farthest: float
@@ -234,9 +232,9 @@ def _described(
 def _by_ring(
     measure: Callable[[NDArray[Any]], Any],
     values: NDArray[Any],
-    ring: Integers,
-    number: Integers,
-) -> Floats:
+    ring: Int64Array,
+    number: Int64Array,
+) -> Float64Array:
     """(R,) a measure of the values of each ring, which has ``number`` of them; 0 without any."""
     parts = np.split(values[np.argsort(ring, kind="stable")], np.cumsum(number)[:-1])
     return np.array([measure(part) if len(part) else 0.0 for part in parts])
@@ -262,7 +260,7 @@ def _highest_first(model: Model) -> Model:
     return Model(tangents, heights, offset, model.turn, model.motion)
 
 
-def _check(model: Model, ring: Integers, off: Floats) -> None:
+def _check(model: Model, ring: Int64Array, off: Float64Array) -> None:
     """Refuse beams that are none.
 
     Raises:
@@ -286,8 +284,8 @@ def _check(model: Model, ring: Integers, off: Floats) -> None:
 def _azimuths(
     scans: Sequence[Scan],
     cloud: Cloud,
-    points: Floats,
-    ring: Integers,
+    points: Float64Array,
+    ring: Int64Array,
     rows: int,
 ) -> Azimuths:
     turns = []
@@ -295,7 +293,7 @@ def _azimuths(
         use = np.flatnonzero(
             (cloud.scan == number) & (np.hypot(points[:, 0], points[:, 1]) > NEAREST)
         )
-        time: Floats | None = None
+        time: Float64Array | None = None
         if scans[number].time is not None:
             time = cloud.time[use]
         elif follows_time(scans[number].points):

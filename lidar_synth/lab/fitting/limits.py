@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lidar_synth.geometry.arrays import Float64Array
 
 STEPS = (0.05, 0.04, 0.03, 0.025, 0.02, 0.01, 0.005, 0.004, 0.003, 0.0025, 0.002, 0.001)
 """Steps of the range that are tried, metres."""
@@ -15,14 +15,16 @@ COHERENT = 0.6
 """Share of a beam's points on a common phase from which its ranges are in steps."""
 
 
-def range_limits(distance: Floats) -> tuple[float, float]:
+def range_limits(distance: Float64Array) -> tuple[float, float]:
     """The nearest and the farthest range, metres, rounded outward to centimetres."""
     return float(np.floor(distance.min() * 100) / 100), float(
         np.ceil(distance.max() * 100) / 100
     )
 
 
-def range_step(distance: Floats, ring: NDArray[np.int64], beams: int) -> float | None:
+def range_step(
+    distance: Float64Array, ring: NDArray[np.int64], beams: int
+) -> float | None:
     """The largest step in which the ranges of each beam are given, metres; None if they are in
     none.
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.lines import Floats, nearest_beams
+from lidar_synth.geometry.arrays import Float64Array
+from lidar_synth.geometry.lines import nearest_beams
 from lidar_synth.lab.fitting.model import Model
 
 STRAY = np.radians(0.06)
@@ -22,7 +23,7 @@ LOST_NEAREST = 1.5
 line by 0.2 degrees."""
 
 
-def add_lost_beams(model: Model, points: Floats) -> Model:
+def add_lost_beams(model: Model, points: Float64Array) -> Model:
     """The model with beams that have too few points to be peaks beside the others, such as those
     that see the sky.
 
@@ -54,20 +55,22 @@ def add_lost_beams(model: Model, points: Floats) -> Model:
     return replace(model, tangents=np.tan(beams), heights=np.array(heights))
 
 
-def _distance(elevation: Floats, beams: Floats) -> Floats:
+def _distance(elevation: Float64Array, beams: Float64Array) -> Float64Array:
     """(N,) radians from each elevation to the nearest beam."""
     up = np.sort(beams)
     nearest = np.searchsorted((up[1:] + up[:-1]) / 2, elevation)
     return np.asarray(np.abs(elevation - up[nearest]))
 
 
-def _count(elevation: Floats, places: Floats) -> NDArray[np.intp]:
+def _count(elevation: Float64Array, places: Float64Array) -> NDArray[np.intp]:
     """Number of elevations (sorted) within ``WINDOW`` of each place."""
     above = np.searchsorted(elevation, places + WINDOW)
     return np.asarray(above - np.searchsorted(elevation, places - WINDOW), np.intp)
 
 
-def _stands_alone(elevation: Floats, place: float, beams: Floats, points: int) -> bool:
+def _stands_alone(
+    elevation: Float64Array, place: float, beams: Float64Array, points: int
+) -> bool:
     """Whether fewer than a third as many points lie somewhere between a place and the next beam on
     either side."""
     for side in (1, -1):

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from lidar_synth.geometry.arrays import Float64Array, Int64Array
 from lidar_synth.geometry.deskew import rotate
-from lidar_synth.geometry.lines import Floats, Integers, nearest_beams, residuals
+from lidar_synth.geometry.lines import nearest_beams, residuals
 
 STEPS = 12
 CAP = np.radians(0.1)
@@ -39,10 +40,10 @@ class Cloud:
         kept: whether the rings come from the file and stay as they are.
     """
 
-    points: Floats
-    scan: Integers
-    time: Floats
-    ring: Integers
+    points: Float64Array
+    scan: Int64Array
+    time: Float64Array
+    ring: Int64Array
     kept: bool = False
 
 
@@ -58,13 +59,13 @@ class Model:
         motion: (S, 6) velocity (m/s) and turn rate (rad/s) during each scan.
     """
 
-    tangents: Floats
-    heights: Floats
-    offset: Floats
-    turn: Floats
-    motion: Floats
+    tangents: Float64Array
+    heights: Float64Array
+    offset: Float64Array
+    turn: Float64Array
+    motion: Float64Array
 
-    def aligned(self, cloud: Cloud) -> Floats:
+    def aligned(self, cloud: Cloud) -> Float64Array:
         """(N, 3) points in the sensor's own frame at the moment of each."""
         points = cloud.points
         if self.motion.any():
@@ -97,7 +98,9 @@ def refine(
     return model, cloud
 
 
-def _step(cloud: Cloud, points: Floats, model: Model, free: frozenset[str]) -> Model:
+def _step(
+    cloud: Cloud, points: Float64Array, model: Model, free: frozenset[str]
+) -> Model:
     beams = len(model.tangents)
     scans = len(model.motion)
     residual = residuals(points, cloud.ring, model.tangents, model.heights)
@@ -126,7 +129,9 @@ def _step(cloud: Cloud, points: Floats, model: Model, free: frozenset[str]) -> M
     return _moved(model, step)
 
 
-def _spread_of_scans(residual: Floats, scan: Integers, scans: int) -> Floats:
+def _spread_of_scans(
+    residual: Float64Array, scan: Int64Array, scans: int
+) -> Float64Array:
     """(S,) scale of the robust weights, radians: a scan that is still bent by motion keeps a wide
     one."""
     spread = np.full(scans, np.inf)
@@ -137,7 +142,7 @@ def _spread_of_scans(residual: Floats, scan: Integers, scans: int) -> Floats:
     return spread
 
 
-def _jacobian(points: Floats, cloud: Cloud, model: Model) -> Floats:
+def _jacobian(points: Float64Array, cloud: Cloud, model: Model) -> Float64Array:
     """(N, 14) change of the residual per tangent, height, mounting (offset, tilt) and motion (the
     same, times time)."""
     x, y, z = points.T
@@ -161,7 +166,9 @@ def _jacobian(points: Floats, cloud: Cloud, model: Model) -> Floats:
     return np.asarray(np.concatenate(columns, 1) * gain[:, None])
 
 
-def _add_priors(normal: Floats, right: Floats, model: Model, scale: float) -> None:
+def _add_priors(
+    normal: Float64Array, right: Float64Array, model: Model, scale: float
+) -> None:
     beams = len(model.tangents)
     scans = len(model.motion)
     sigma = np.full(len(right), np.inf)
@@ -177,7 +184,9 @@ def _add_priors(normal: Floats, right: Floats, model: Model, scale: float) -> No
     _add_block_prior(normal, right, model, scale)
 
 
-def _add_block_prior(normal: Floats, right: Floats, model: Model, scale: float) -> None:
+def _add_block_prior(
+    normal: Float64Array, right: Float64Array, model: Model, scale: float
+) -> None:
     """Lasers of one block stand at nearly the same height; robust, because there can be several
     blocks."""
     step = np.diff(model.heights)
@@ -203,7 +212,9 @@ def _active(beams: int, scans: int, free: frozenset[str]) -> NDArray[np.bool_]:
     return np.concatenate([np.tile(beam, beams), mount, np.tile(motion, scans)])
 
 
-def _solve(normal: Floats, right: Floats, active: NDArray[np.bool_]) -> Floats:
+def _solve(
+    normal: Float64Array, right: Float64Array, active: NDArray[np.bool_]
+) -> Float64Array:
     step = np.zeros(len(right))
     use = np.flatnonzero(active & (np.diag(normal) > 0))
     size = 1 / np.sqrt(np.diag(normal)[use])
@@ -212,7 +223,7 @@ def _solve(normal: Floats, right: Floats, active: NDArray[np.bool_]) -> Floats:
     return step
 
 
-def _moved(model: Model, step: Floats) -> Model:
+def _moved(model: Model, step: Float64Array) -> Model:
     """The model after a step; the mounting moves in the sensor's frame."""
     beams = len(model.tangents)
     shift = step[2 * beams : 2 * beams + 3]

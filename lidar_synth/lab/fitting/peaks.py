@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lidar_synth.geometry.arrays import Float64Array
 
 BIN = np.radians(0.004)
 """Width of a bin of the histogram of elevations, radians."""
@@ -18,7 +18,9 @@ SMALLEST = 0.04
 """A beam's peak has at least this share of the median peak's points."""
 
 
-def density(elevations: Floats, width: float) -> tuple[Floats, Floats]:
+def density(
+    elevations: Float64Array, width: float
+) -> tuple[Float64Array, Float64Array]:
     """The smoothed histogram of elevations: (K,) points per bin, and (K,) the bins' centres,
     radians.
 
@@ -36,7 +38,7 @@ def density(elevations: Floats, width: float) -> tuple[Floats, Floats]:
     return np.convolve(histogram, kernel / kernel.sum(), "same"), centres
 
 
-def beam_peaks(elevations: Floats, width: float) -> Floats:
+def beam_peaks(elevations: Float64Array, width: float) -> Float64Array:
     """(B,) elevations of the beams, highest first, radians.
 
     Args:
@@ -55,7 +57,7 @@ def beam_peaks(elevations: Floats, width: float) -> Floats:
     return np.asarray(centres[top][::-1])
 
 
-def _extrema(values: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _extrema(values: Float64Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Local maxima (P,), and the minima (P - 1,) between them."""
     rising = np.diff(np.concatenate([[0.0], values, [0.0]]))
     sign = np.sign(rising)
@@ -66,7 +68,7 @@ def _extrema(values: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _persistent(
-    values: Floats, top: NDArray[np.intp], bottom: NDArray[np.intp]
+    values: Float64Array, top: NDArray[np.intp], bottom: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The peaks that remain when those without contrast to a neighbour are merged into it, weakest
     first."""

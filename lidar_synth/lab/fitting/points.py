@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry import Scan, Sensor, require_finite
-from lidar_synth.geometry.lines import Floats
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
 from lidar_synth.lab.fitting.model import Cloud
 
@@ -38,7 +38,7 @@ def gather(scans: Sequence[Scan]) -> Cloud:
     return Cloud(points, number, np.concatenate(times), np.full(len(points), -1))
 
 
-def turn_fraction(points: NDArray[np.float32]) -> Floats:
+def turn_fraction(points: NDArray[np.float32]) -> Float64Array:
     """(N,) fraction of the turn at which each point was measured, about -0.5 to 0.5.
 
     The turn starts where the file does, if its points are in the order of time; otherwise behind
@@ -58,7 +58,7 @@ def follows_time(points: NDArray[np.float32]) -> bool:
     return bool(ONE_TURN[0] < abs(unwrapped[-1]) and np.ptp(unwrapped) < ONE_TURN[1])
 
 
-def _unwrapped(points: NDArray[np.float32]) -> Floats:
+def _unwrapped(points: NDArray[np.float32]) -> Float64Array:
     """(N,) turns from the first point, following the order of the points."""
     azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / (2 * np.pi)
     step = np.diff(azimuth, prepend=azimuth[0])

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lidar_synth.geometry import spread
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.lines import nearest_beams, residuals
 from lidar_synth.lab.fitting.model import CAP, Cloud, Model
-
-Floats = NDArray[np.float64]
 
 SCANS = 3
 """Number of scans that are searched."""
@@ -61,7 +60,7 @@ _NARROW = 128  # sectors within which a tilt of a degree moves no point by more 
 _SECTORS = (64, 32, 16, 8, 4, 2, 1)
 
 
-def find_mount(scans: Sequence[Floats]) -> tuple[Floats, Floats]:
+def find_mount(scans: Sequence[Float64Array]) -> tuple[Float64Array, Float64Array]:
     """(3,) offset and (3, 3) rotation of the sensor in the frame of the points.
 
     Each of some scans is searched alone, because the car's motion blurs some of them; the sharpest
@@ -81,7 +80,7 @@ def find_mount(scans: Sequence[Floats]) -> tuple[Floats, Floats]:
     return place[:3], tilt_of(place[3:])
 
 
-def find_motion(cloud: Cloud, model: Model, scan: int) -> Floats:
+def find_motion(cloud: Cloud, model: Model, scan: int) -> Float64Array:
     """(6,) the motion of one scan for which its points lie best on the beams of the model.
 
     Args:
@@ -107,7 +106,7 @@ def find_motion(cloud: Cloud, model: Model, scan: int) -> Floats:
         for a in angles
     ]
 
-    def mean_residual(motion: Floats) -> float:
+    def mean_residual(motion: Float64Array) -> float:
         moved = replace(model, motion=motion[None])
         points = moved.aligned(part)
         ring = (
@@ -124,7 +123,7 @@ def find_motion(cloud: Cloud, model: Model, scan: int) -> Floats:
     )
 
 
-def _place_in(points: Floats, starts: int) -> tuple[float, Floats]:
+def _place_in(points: Float64Array, starts: int) -> tuple[float, Float64Array]:
     """The sharpness of one scan's elevations at its best place, and the place, from some starts on
     the grid."""
     points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
@@ -147,8 +146,8 @@ def _place_in(points: Floats, starts: int) -> tuple[float, Floats]:
 
 
 def _sharpen(
-    place: Floats, dense: Floats, points: Floats, least: float
-) -> tuple[float, Floats]:
+    place: Float64Array, dense: Float64Array, points: Float64Array, least: float
+) -> tuple[float, Float64Array]:
     """The best sharpness near a place, and where; given up when it is not above ``least``."""
     for sectors in _SECTORS:
         value = partial(_sharpness_within, dense if sectors > 32 else points, sectors)
@@ -160,13 +159,13 @@ def _sharpen(
     return sharp, place
 
 
-def tilt_of(angles: Floats) -> Floats:
+def tilt_of(angles: Float64Array) -> Float64Array:
     """(3, 3) rotation by small angles about x and y, radians."""
     turned = Rotation.from_rotvec([angles[0], angles[1], 0.0])
     return np.asarray(turned.as_matrix())
 
 
-def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
+def sector_sharpness(points: Float64Array, place: Float64Array, sectors: int) -> float:
     """How much the elevations concentrate within each of some sectors of azimuth, seen from a
     place.
 
@@ -201,14 +200,14 @@ def _measure_concentration(ordered: NDArray[np.int32]) -> float:
     return WIDE**2 * fine / max(coarse, 1.0)
 
 
-def _sharpness_within(points: Floats, sectors: int, place: Floats) -> float:
+def _sharpness_within(points: Float64Array, sectors: int, place: Float64Array) -> float:
     limit = np.array([*REACH, TILT, TILT])
     if (np.abs(place) <= limit).all():
         return sector_sharpness(points, place, sectors)
     return 0.0
 
 
-def _best_on_grid(points: Floats, count: int) -> list[Floats]:
+def _best_on_grid(points: Float64Array, count: int) -> list[Float64Array]:
     """The places of the grid where elevations concentrate most within narrow sectors, the best one
     first."""
     sides = (-1.2, 0.0, 1.2)
@@ -223,8 +222,11 @@ def _best_on_grid(points: Floats, count: int) -> list[Floats]:
 
 
 def climb(
-    value: Callable[[Floats], float], place: Floats, step: Floats, halvings: int = 6
-) -> Floats:
+    value: Callable[[Float64Array], float],
+    place: Float64Array,
+    step: Float64Array,
+    halvings: int = 6,
+) -> Float64Array:
     """Pattern search (Hooke and Jeeves): steps along each axis in turn, then as far again the same
     way while it helps.
 
@@ -249,8 +251,11 @@ def climb(
 
 
 def _explored(
-    value: Callable[[Floats], float], place: Floats, best: float, step: Floats
-) -> tuple[Floats, float]:
+    value: Callable[[Float64Array], float],
+    place: Float64Array,
+    best: float,
+    step: Float64Array,
+) -> tuple[Float64Array, float]:
     """The place after one step along each axis, where it is better, and its value."""
     for axis in np.flatnonzero(step):
         for side in (step[axis], -step[axis]):

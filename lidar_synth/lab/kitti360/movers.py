@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import MAX_INSTANCES
 from lidar_synth.formats.kitti360_boxes import WorldBoxes
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.kitti360.accumulated import cloud_values
-
-Floats = NDArray[np.float64]
 
 MARGIN = 0.2
 """Distance, metres, up to which points outside a box belong to it."""
@@ -44,8 +43,8 @@ class MovingTrack:
     """
 
     instance: int
-    boxes: dict[int, Floats]
-    points: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    boxes: dict[int, Float64Array]
+    points: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
     values: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
 
     @property
@@ -93,7 +92,7 @@ class Movers:
         self.tracks = [track for track in tracks if track.moves]
         self._rest = points[free], values[free], frame[free]
 
-    def at(self, frame: int) -> tuple[Floats, NDArray[np.uint32]]:
+    def at(self, frame: int) -> tuple[Float64Array, NDArray[np.uint32]]:
         """(N, 3) points in the world and (N,) label values of all moving objects at a frame."""
         now = self._rest[2] == frame
         points = [self._rest[0][now]]
@@ -110,8 +109,8 @@ class Movers:
 
 
 def find_inside(
-    box: Floats,
-    points: Floats,
+    box: Float64Array,
+    points: Float64Array,
     margin: float = 0.0,
     floor: float = 0.0,
 ) -> NDArray[np.intp]:
@@ -134,11 +133,11 @@ def find_inside(
     return np.asarray(near[kept])
 
 
-def _points(cloud: NDArray[np.void]) -> Floats:
+def _points(cloud: NDArray[np.void]) -> Float64Array:
     return np.column_stack([cloud[axis] for axis in "xyz"]).astype(np.float64)
 
 
-def _rigid(box: Floats) -> Floats:
+def _rigid(box: Float64Array) -> Float64Array:
     """(4, 4) from the frame of a box, in metres, to the world."""
     rigid = box.copy()
     rigid[:3, :3] /= np.linalg.norm(box[:3, :3], axis=0)
@@ -179,7 +178,7 @@ def _tracks(boxes: WorldBoxes, frames: range) -> list[MovingTrack]:
 
 def _gather(
     track: MovingTrack,
-    points: Floats,
+    points: Float64Array,
     values: NDArray[np.uint32],
     frame: NDArray[np.int64],
     free: NDArray[np.bool_],

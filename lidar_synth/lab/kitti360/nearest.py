@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-Floats = NDArray[np.float32]
+from lidar_synth.geometry.arrays import Float32Array
 
 VOXEL = 0.05
 """Side of the cubes in which points of one class are reduced to one point, metres."""
@@ -34,9 +34,9 @@ class Vote(NamedTuple):
     """
 
     value: NDArray[np.uint32]
-    share: Floats
-    trust: Floats
-    distance: Floats
+    share: Float32Array
+    trust: Float32Array
+    distance: Float32Array
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class NearestLabels:
     """
 
     low: NDArray[np.float64]
-    points: Floats
+    points: Float32Array
     values: NDArray[np.uint32]
-    confidence: Floats
+    confidence: Float32Array
     tree: cKDTree
 
     def __len__(self) -> int:
@@ -103,7 +103,7 @@ class NearestLabels:
         return np.where(np.isfinite(distance), found, -1), distance
 
 
-Chunk = tuple[NDArray[np.floating], NDArray[np.uint32], Floats]
+Chunk = tuple[NDArray[np.floating], NDArray[np.uint32], Float32Array]
 """Points (N, 3), label values (N,) and confidence (N,)."""
 
 
@@ -132,10 +132,10 @@ def index_cloud(
 
 
 def _thin(
-    points: Floats,
+    points: Float32Array,
     values: NDArray[np.uint32],
-    confidence: Floats,
-) -> tuple[Floats, NDArray[np.uint32], Floats]:
+    confidence: Float32Array,
+) -> tuple[Float32Array, NDArray[np.uint32], Float32Array]:
     """Points sorted by their cubes and classes, the first of each."""
     places = np.column_stack([points / VOXEL, values % _CLASSES]).astype(np.int64)
     keys = np.ravel_multi_index(places.T, places.max(axis=0, initial=0) + 1)

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.formats.kitti360_boxes import WorldBoxes
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.kitti360.accumulated import Window, cloud_values, read_cloud
 from lidar_synth.lab.kitti360.movers import FLOOR, MARGIN, Movers, find_inside
 from lidar_synth.lab.kitti360.nearest import Chunk, index_cloud
 from lidar_synth.lab.kitti360.registration import apply, find_surfaces, register
-
-Floats = NDArray[np.float64]
 
 RADIUS = 0.3
 """Maximum distance of a neighbour, metres."""
@@ -94,7 +93,7 @@ class Recovered:
     fits: bool
 
 
-def _find_bounds(places: Floats, name: str) -> tuple[Floats, Floats]:
+def _find_bounds(places: Float64Array, name: str) -> tuple[Float64Array, Float64Array]:
     """The lowest and the highest coordinates in view of the places (N, 3) of a window's scans."""
     low = places.min(axis=0) + np.array([-VIEW, -VIEW, _HEIGHTS[0]])
     high = places.max(axis=0) + np.array([VIEW, VIEW, _HEIGHTS[1]])
@@ -125,7 +124,7 @@ class Recovery:
         self,
         windows: Sequence[Window],
         boxes: WorldBoxes | None,
-        poses: Mapping[int, Floats],
+        poses: Mapping[int, Float64Array],
         frames: Sequence[int],
     ) -> None:
         places = np.array([poses[f][:3, 3] for f in frames])
@@ -138,7 +137,7 @@ class Recovery:
         self.movers = Movers(dynamic, boxes, span)
         self.turns = True
         self._surfaces = find_surfaces(self._static)
-        self._moves: dict[int, Floats] = {}
+        self._moves: dict[int, Float64Array] = {}
 
     def choose_motion(self, scans: Mapping[int, NDArray[np.float32]]) -> None:
         """Find out whether scans were measured while the car moved, or are compensated, by what
@@ -160,7 +159,7 @@ class Recovery:
             )
         self.turns = fits[0] >= fits[1]
 
-    def place(self, points: NDArray[np.float32], frame: int) -> Floats:
+    def place(self, points: NDArray[np.float32], frame: int) -> Float64Array:
         """(N, 3) the points of a scan in the world."""
         pose = self._poses[frame]
         local = (
@@ -220,7 +219,7 @@ class Recovery:
 
     def _vote_of_movers(
         self,
-        placed: Floats,
+        placed: Float64Array,
         frame: int,
         values: NDArray[np.uint32],
         share: NDArray[np.float32],
@@ -248,7 +247,7 @@ class Recovery:
 
     def _label_boxed(
         self,
-        placed: Floats,
+        placed: Float64Array,
         frame: int,
         values: NDArray[np.uint32],
         confidence: NDArray[np.float32],
@@ -270,7 +269,7 @@ class Recovery:
         return boxed
 
     def _on_clouds(
-        self, placed: Floats, points: NDArray[np.float32]
+        self, placed: Float64Array, points: NDArray[np.float32]
     ) -> tuple[int, int]:
         """Of some upright points, the numbers of those on the clouds, and of those that the clouds
         reach."""
@@ -304,7 +303,7 @@ def _chunks(windows: Sequence[Window]) -> Iterator[Chunk]:
             yield points, cloud_values(part, str(window.static)), trust
 
 
-def ego_motion(poses: Mapping[int, Floats], frame: int) -> Floats:
+def ego_motion(poses: Mapping[int, Float64Array], frame: int) -> Float64Array:
     """(4, 4) the sensor of the frame before, in the frame of the sensor at ``frame``.
 
     Without a pose of the frame before, the motion to the next frame is taken; without both, the car
@@ -317,7 +316,7 @@ def ego_motion(poses: Mapping[int, Floats], frame: int) -> Floats:
     return np.eye(4)
 
 
-def undo_ego_motion(points: NDArray[np.floating], motion: Floats) -> Floats:
+def undo_ego_motion(points: NDArray[np.floating], motion: Float64Array) -> Float64Array:
     """Points of one revolution as seen from the sensor's place at the moment of the pose.
 
     The sensor turns clockwise once per frame and looks ahead at the moment of the pose, so a point
@@ -333,7 +332,7 @@ def undo_ego_motion(points: NDArray[np.floating], motion: Floats) -> Floats:
     )
     skew = (motion[:3, :3] - motion[:3, :3].T) / 2
     sine = np.sqrt((skew**2).sum() / 2)
-    moved: Floats = points + share * motion[:3, 3]
+    moved: Float64Array = points + share * motion[:3, 3]
     if sine > 0:  # Rodrigues' formula
         angle = share * np.arcsin(min(sine, 1.0))
         turned = points @ (skew.T / sine)

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.kitti360.nearest import NearestLabels, index_cloud
-
-Floats = NDArray[np.float64]
 
 _SIDE = 0.5  # metres, of a cube
 _FEWEST = 6  # points of a cube that show its shape
@@ -50,13 +49,13 @@ class SurfaceMap:
     """
 
     index: NearestLabels
-    means: Floats
-    axes: Floats
-    origin: Floats
+    means: Float64Array
+    axes: Float64Array
+    origin: Float64Array
 
     def residuals(
-        self, points: Floats, radius: float
-    ) -> tuple[NDArray[np.intp], Floats]:
+        self, points: Float64Array, radius: float
+    ) -> tuple[NDArray[np.intp], Float64Array]:
         """The points (of N, 3) with a cube, as (K,) indices, and (K, 3, 4): the scaled axes, and
         the residual."""
         found = self.index.nearest(points, radius, 1)[0][:, 0]
@@ -103,7 +102,7 @@ def find_surfaces(cloud: NearestLabels) -> SurfaceMap:
     return SurfaceMap(index, means, scaled, cloud.low)
 
 
-def register(points: Floats, surfaces: SurfaceMap) -> Floats:
+def register(points: Float64Array, surfaces: SurfaceMap) -> Float64Array:
     """(4, 4) the transform in the world that lays points (N, 3) onto surfaces; the identity if it
     gains too little."""
     given = np.eye(4)
@@ -122,11 +121,11 @@ def register(points: Floats, surfaces: SurfaceMap) -> Floats:
 
 
 def _descend(
-    transform: Floats,
-    points: Floats,
+    transform: Float64Array,
+    points: Float64Array,
     surfaces: SurfaceMap,
     radii: tuple[float, ...],
-) -> tuple[Floats, Floats | None]:
+) -> tuple[Float64Array, Float64Array | None]:
     """The transform after some steps, and its (6, 6) certainty, translation first; None without
     enough points."""
     centre = points.mean(axis=0)
@@ -152,7 +151,9 @@ def _descend(
     return transform, certain
 
 
-def _score(transform: Floats, points: Floats, surfaces: SurfaceMap) -> float:
+def _score(
+    transform: Float64Array, points: Float64Array, surfaces: SurfaceMap
+) -> float:
     return float(
         _robust(
             surfaces.residuals(apply(transform, points), _CLOSE[0])[1][:, :, 3],
@@ -161,20 +162,20 @@ def _score(transform: Floats, points: Floats, surfaces: SurfaceMap) -> float:
     )
 
 
-def _robust(off: Floats, scale: float) -> Floats:
+def _robust(off: Float64Array, scale: float) -> Float64Array:
     """The weights of Geman and McClure for residuals (K, 3)."""
     squared = (off**2).sum(axis=1)
-    weights: Floats = (1 + squared / scale**2) ** -2
+    weights: Float64Array = (1 + squared / scale**2) ** -2
     return weights
 
 
-def apply(transform: Floats, points: Floats) -> Floats:
+def apply(transform: Float64Array, points: Float64Array) -> Float64Array:
     """Points (N, 3) moved by a (4, 4) transform."""
-    moved: Floats = points @ transform[:3, :3].T + transform[:3, 3]
+    moved: Float64Array = points @ transform[:3, :3].T + transform[:3, 3]
     return moved
 
 
-def _small(step: Floats, centre: Floats) -> Floats:
+def _small(step: Float64Array, centre: Float64Array) -> Float64Array:
     """(4, 4) a translation and a small rotation vector about a point, made orthogonal."""
     x, y, z = step[3:]
     turned, _, back = np.linalg.svd(
@@ -186,5 +187,5 @@ def _small(step: Floats, centre: Floats) -> Floats:
     return transform
 
 
-def _sums(values: NDArray[np.float32], starts: NDArray[np.intp]) -> Floats:
+def _sums(values: NDArray[np.float32], starts: NDArray[np.intp]) -> Float64Array:
     return np.asarray(np.add.reduceat(values, starts, axis=0, dtype=np.float64))

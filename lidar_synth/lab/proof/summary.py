@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.proof.arms import BASE, GENERATOR_BUDGET, Row
 from lidar_synth.lab.proof.machine import command_line, machine
 from lidar_synth.lab.proof.plan import Pair, ProofPlan, count_scans
@@ -20,8 +20,6 @@ from lidar_synth.lab.proof.scores import (
 )
 from lidar_synth.lab.proof.trial import LOOKS, TrialOutcome
 from lidar_synth.lab.town.returns import CALIBRATED_ON
-
-Floats = NDArray[np.float64]
 
 Results = dict[Pair, dict[Row, TrialOutcome]]
 """{pair: {arm: outcome}} of the complete pairs."""
@@ -149,7 +147,7 @@ def _scores(
     row: Row,
     places: Sequence[str],
     seeds: Sequence[int],
-) -> Floats:
+) -> Float64Array:
     """(P, S) mIoU in per cent; NaN where there is no training."""
     scores = np.full((len(places), len(seeds)), np.nan)
     for (place, seed), outcomes in found.items():
@@ -158,12 +156,12 @@ def _scores(
     return scores
 
 
-def _mean(values: Floats) -> float:
+def _mean(values: Float64Array) -> float:
     """The mean over places of the means over seeds."""
     return float(np.nanmean(np.nanmean(values, 1)))
 
 
-def _interval(plan: ProofPlan, differences: Floats) -> tuple[float, float] | None:
+def _interval(plan: ProofPlan, differences: Float64Array) -> tuple[float, float] | None:
     return interval(differences, shared=plan.training is not None)
 
 
@@ -171,8 +169,8 @@ def _arm(
     plan: ProofPlan,
     found: Results,
     row: Row,
-    scores: Mapping[Row, Floats],
-    base: Floats,
+    scores: Mapping[Row, Float64Array],
+    base: Float64Array,
     preparation: float,
     places: Sequence[str],
 ) -> dict[str, Any]:
@@ -253,7 +251,7 @@ def _curve(
 
 
 def _chosen_elsewhere(
-    plan: ProofPlan, scores: Mapping[Row, Floats]
+    plan: ProofPlan, scores: Mapping[Row, Float64Array]
 ) -> dict[str, Any] | None:
     """The gain in each place of the arm with synthetic scans that is best in the other places."""
     base = scores[plan.rows[0]]
@@ -275,7 +273,7 @@ def _chosen_elsewhere(
 
 
 def _over_best_real(
-    plan: ProofPlan, scores: Mapping[Row, Floats]
+    plan: ProofPlan, scores: Mapping[Row, Float64Array]
 ) -> dict[str, Any] | None:
     """The best arm with synthetic scans against the best arm with real scans only and as many
     iterations."""

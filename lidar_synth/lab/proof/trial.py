@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Scan, Sensor
+from lidar_synth.geometry.arrays import Int64Array
 from lidar_synth.geometry.projection import project
 from lidar_synth.lab.evaluate.segmentation import Images, confusion
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
@@ -26,8 +26,6 @@ from lidar_synth.lab.proof.arms import REAL, ArmStage, Row, policy_of
 from lidar_synth.lab.train.segmentation import endless_batches, train_segmenter
 from lidar_synth.labels.augment import mirror_scan, rotate_scan
 from lidar_synth.mixing import MixedScans, settle
-
-Integers = NDArray[np.int64]
 
 LOOKS = 8
 """Points of the curve of a training."""
@@ -135,13 +133,13 @@ class TrialOutcome:
         seconds: that the training took.
     """
 
-    table: Integers
-    curve: list[tuple[int, Integers]] = field(default_factory=list)
+    table: Int64Array
+    curve: list[tuple[int, Int64Array]] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)
     seconds: float = 0.0
 
 
-Outcome = TrialOutcome | Integers
+Outcome = TrialOutcome | Int64Array
 Trainer = Callable[[Job], Mapping[str, Outcome] | Outcome]
 """Trains as a job says and tests on its held-out scans; returns {place: outcome}, or an outcome if
 there is one place. An outcome is a ``TrialOutcome``, or its table alone."""
@@ -191,7 +189,7 @@ def _outcome_of(result: Outcome, seconds: float) -> TrialOutcome:
     return replace(outcome, seconds=seconds)
 
 
-Tables = dict[str, Integers]
+Tables = dict[str, Int64Array]
 """{place: table}"""
 
 
@@ -264,7 +262,7 @@ def images(scans: Sequence[Scan], sensor: Sensor) -> list[Images]:
 
 def _test(
     network: nn.Module, held_out: Sequence[Images], height: Tensor, half: bool
-) -> Integers:
+) -> Int64Array:
     network.eval()
     with torch.autocast(height.device.type, torch.bfloat16, enabled=half):
         return confusion(network, held_out, height)

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.town.catalogue import TABLES
 from lidar_synth.lab.town.materials import read_finishes
-from lidar_synth.lab.town.meshes import Array, Mesh, ball, boxes, merge, tube
+from lidar_synth.lab.town.meshes import Mesh, ball, boxes, merge, tube
 from lidar_synth.lab.town.objects import Prototype, assemble
 from lidar_synth.lab.town.vehicles import vehicles
 
@@ -118,7 +119,7 @@ def sitter() -> Prototype:
     return Prototype(mesh, _BODY, "Person_sitting", (30, 254))
 
 
-def _bend_knee(top: Array, foot: Array) -> Array:
+def _bend_knee(top: Float64Array, foot: Float64Array) -> Float64Array:
     """The place of the knee of a leg of 0.88 m, in front of the line from hip to foot."""
     reach = max(0.05, 0.44**2 - float(np.sum((foot - top) ** 2)) / 4) ** 0.5
     across = np.array((top[2] - foot[2], 0, foot[0] - top[0]))

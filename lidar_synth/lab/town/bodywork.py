@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidar_synth.lab.town.meshes import Array, Mesh, disc, loft, merge, quads, tube
+from lidar_synth.geometry.arrays import Float64Array
+from lidar_synth.lab.town.meshes import Mesh, disc, loft, merge, quads, tube
 
 PAINT, GLASS, TYRE, TRIM, PLATE, HEAD, TAIL, INTERIOR, RIM, SECONDARY = range(10)
 
@@ -35,7 +36,7 @@ class Station(NamedTuple):
     side: int = PAINT
     above: int = PAINT
 
-    def outline(self, length: float, width: float) -> Array:
+    def outline(self, length: float, width: float) -> Float64Array:
         """(9, 3) its corners, from the right sill over the roof to the left one."""
         half = self.width * width / 2
         middle = self.sill + 0.55 * (self.belt - self.sill)
@@ -77,7 +78,7 @@ def shell(
     return whole.moved((at, 0, 0))
 
 
-def _end(section: Array) -> Mesh:
+def _end(section: Float64Array) -> Mesh:
     """The flat front or rear of a body: quadrilaterals between the left and right half of a
     cross-section."""
     right = section[:5]

@@ -9,9 +9,9 @@ or roll.
 import numpy as np
 
 from lidar_synth.geometry import Boxes
+from lidar_synth.geometry.arrays import Float32Array, Float64Array
 from lidar_synth.lab.town.camera import CAMERA, pixel_rays
 from lidar_synth.lab.town.cast import Snapshot, trace
-from lidar_synth.lab.town.meshes import Array, Floats
 from lidar_synth.lab.town.scene import PlacedObject, Pose
 
 _GRID = 12
@@ -53,7 +53,7 @@ def boxes_of(objects: list[PlacedObject], pose: Pose, snapshot: Snapshot) -> Box
     return Boxes(values, names, truncation, occlusion, image_box, instance=instance)
 
 
-def box_values(placed: PlacedObject, in_sensor: Pose) -> Array:
+def box_values(placed: PlacedObject, in_sensor: Pose) -> Float64Array:
     """(7,) centre, size and yaw of an object's box, from its pose in the sensor frame."""
     low, high = placed.prototype.mesh.bounds
     middle = placed.scale * (low + high) / 2
@@ -62,7 +62,9 @@ def box_values(placed: PlacedObject, in_sensor: Pose) -> Array:
     return np.concatenate([centre, placed.scale * (high - low), [yaw]])
 
 
-def _image_box_of(placed: PlacedObject, in_sensor: Pose) -> tuple[Array | float, float]:
+def _image_box_of(
+    placed: PlacedObject, in_sensor: Pose
+) -> tuple[Float64Array | float, float]:
     """The image box (left, top, right, bottom) of an object and its truncation, the share of its
     outline's corners that lie outside the image; -1, -1 if the object is not in the image."""
     assert CAMERA.image_size is not None
@@ -82,7 +84,7 @@ def _image_box_of(placed: PlacedObject, in_sensor: Pose) -> tuple[Array | float,
 
 def _visible_shares(
     objects: list[PlacedObject],
-    image_boxes: Floats,
+    image_boxes: Float32Array,
     pose: Pose,
     snapshot: Snapshot,
 ) -> list[float]:
@@ -107,9 +109,9 @@ def _visible_shares(
 
 def _rays_towards(
     placed: PlacedObject,
-    box: Floats,
+    box: Float32Array,
     pose: Pose,
-) -> tuple[Floats, Floats]:
+) -> tuple[Float32Array, Float32Array]:
     """Directions of camera rays that hit an object if nothing is in front of it, and how far it is
     along them."""
     left, top, right, bottom = box

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.town.catalogue import Rng, pick_colour
 from lidar_synth.lab.town.facades import (
     DOOR,
@@ -21,7 +22,7 @@ from lidar_synth.lab.town.facades import (
     wall_around,
 )
 from lidar_synth.lab.town.materials import Finish
-from lidar_synth.lab.town.meshes import Array, Mesh, boxes, merge, quads, tube
+from lidar_synth.lab.town.meshes import Mesh, boxes, merge, quads, tube
 from lidar_synth.lab.town.objects import StaticObject, make_object
 
 
@@ -119,7 +120,7 @@ def _roof_faces(
     ]
 
 
-def _skylights(slope: Array, count: int, rng: Rng) -> Mesh:
+def _skylights(slope: Float64Array, count: int, rng: Rng) -> Mesh:
     """``count`` windows at random positions on a slope, given by its corners (4, 3)."""
     a, b, c, d = slope
     up = np.cross(b - a, d - a)

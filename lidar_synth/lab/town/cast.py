@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.lab.town.meshes import Floats, Ints
+from lidar_synth.geometry.arrays import Float32Array, Int32Array
 from lidar_synth.lab.town.scene import PlacedObject
 from lidar_synth.lab.town.world import World
 
@@ -30,17 +30,17 @@ class SceneHits(NamedTuple):
         normal: (N, 3) float32 unit normal in the world frame, of arbitrary sign.
     """
 
-    origins: Floats
-    directions: Floats
-    distance: Floats
-    surface: Ints
-    normal: Floats
+    origins: Float32Array
+    directions: Float32Array
+    distance: Float32Array
+    surface: Int32Array
+    normal: Float32Array
 
     def found(self) -> NDArray[np.intp]:
         """The rays that hit something."""
         return np.flatnonzero(self.surface != MISS)
 
-    def places(self, rays: NDArray[np.intp]) -> Floats:
+    def places(self, rays: NDArray[np.intp]) -> Float32Array:
         """(K, 3) where some rays hit, metres, world frame."""
         way = self.distance[rays, None] * self.directions[rays]
         return np.asarray(self.origins[rays] + way)
@@ -68,7 +68,10 @@ class Snapshot:
         self._radii = np.array(radii, np.float32)
 
     def cast(
-        self, origins: Floats, directions: Floats, eye: Floats | None = None
+        self,
+        origins: Float32Array,
+        directions: Float32Array,
+        eye: Float32Array | None = None,
     ) -> SceneHits:
         """Find the first hit of each ray.
 
@@ -97,7 +100,7 @@ class Snapshot:
         hits: SceneHits,
         rays: NDArray[np.intp],
         step: float,
-        eye: Floats,
+        eye: Float32Array,
     ) -> NDArray[np.intp]:
         """Continue some rays, in place, from ``step`` metres behind their hits; return those that
         hit something again."""
@@ -111,7 +114,7 @@ class Snapshot:
         return np.asarray(rays[beyond.surface != MISS])
 
     def _find_near(
-        self, origins: Floats, directions: Floats, eye: Floats | None
+        self, origins: Float32Array, directions: Float32Array, eye: Float32Array | None
     ) -> Iterable[NDArray[np.bool_]]:
         """Which rays can hit each mover, (N,) for one after another; may include a few more."""
         if eye is None:
@@ -120,7 +123,7 @@ class Snapshot:
         return self._near_from(directions, eye, margin)
 
     def _near_from(
-        self, directions: Floats, eye: Floats, margin: float
+        self, directions: Float32Array, eye: Float32Array, margin: float
     ) -> NDArray[np.bool_]:
         """(M, N) which rays that start within ``margin`` metres of ``eye`` can hit each mover's
         bounding sphere; may include a few more."""
@@ -132,7 +135,7 @@ class Snapshot:
         return np.asarray((offset / far) @ directions.T > cosine.astype(np.float32))
 
     def _near_any(
-        self, origins: Floats, directions: Floats
+        self, origins: Float32Array, directions: Float32Array
     ) -> Iterator[NDArray[np.bool_]]:
         """Which of any rays can hit each mover's bounding sphere: (N,) for one mover after
         another."""
@@ -144,8 +147,8 @@ class Snapshot:
 
 
 def trace(
-    placed: PlacedObject, origins: Floats, directions: Floats
-) -> tuple[Floats, Ints, Floats]:
+    placed: PlacedObject, origins: Float32Array, directions: Float32Array
+) -> tuple[Float32Array, Int32Array, Float32Array]:
     """Distance (inf = no hit), surface number and normal (world frame, not unit) of rays cast at
     one object alone."""
     prototype = placed.prototype

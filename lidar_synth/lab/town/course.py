@@ -6,8 +6,8 @@ Street coordinates are (s, t): metres along the centre line, and metres to its l
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.town.catalogue import Rng
-from lidar_synth.lab.town.meshes import Array
 
 
 class Course:
@@ -36,11 +36,11 @@ class Course:
         self._yaw = np.cumsum(curvature) - curvature.sum() / 2
         self._xy = np.cumsum(np.stack([np.cos(self._yaw), np.sin(self._yaw)]), 1)
 
-    def heading(self, s: ArrayLike) -> Array:
+    def heading(self, s: ArrayLike) -> Float64Array:
         """Heading of the centre line at s, radians counter-clockwise from the world's +x."""
         return np.asarray(np.interp(np.asarray(s, float), self._s, self._yaw))
 
-    def points(self, s: ArrayLike, t: ArrayLike) -> Array:
+    def points(self, s: ArrayLike, t: ArrayLike) -> Float64Array:
         """(..., 2) x and y in the world of street coordinates, metres."""
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
         yaw = self.heading(s)
@@ -69,7 +69,7 @@ class Relief:
         self._banks = np.clip(rng.normal(0, 2.5 * grade, 2), -0.06, 0.10)
         self._far = rng.uniform(1, 9, 2)
 
-    def __call__(self, s: ArrayLike, t: ArrayLike) -> Array:
+    def __call__(self, s: ArrayLike, t: ArrayLike) -> Float64Array:
         """Height at street coordinates, metres."""
         s = np.asarray(s, float)
         t = np.asarray(t, float)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry import Sensor
-from lidar_synth.lab.town.meshes import Array
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.town.objects import assemble
 from lidar_synth.lab.town.solid import Solid
 
@@ -22,7 +22,7 @@ _LASER_OFFSET = 0.026
 """Lateral offset of the lasers from the sensor's axis, metres."""
 
 
-def point_rays(azimuth: Array, elevation: Array) -> Array:
+def point_rays(azimuth: Float64Array, elevation: Float64Array) -> Float64Array:
     """(..., 3) unit vectors; azimuths clockwise, radians."""
     level = np.cos(elevation)
     x = np.cos(azimuth) * level

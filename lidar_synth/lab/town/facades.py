@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.town.catalogue import Rng
-from lidar_synth.lab.town.meshes import Array, Mesh, boxes, merge, quads
+from lidar_synth.lab.town.meshes import Mesh, boxes, merge, quads
 
 WALL, GLASS, FRAME, ROOF, DOOR, PLINTH, ROOM, RAIL, BLIND, SLAB = range(10)
 
-Frame = tuple[Array, Array, Array]
+Frame = tuple[Float64Array, Float64Array, Float64Array]
 """The frame of a wall: its lower left corner, and unit vectors along the wall and into the
 building."""
 FRONT: Frame = (np.zeros(3), np.eye(3)[0], np.eye(3)[1])
@@ -54,7 +55,7 @@ class BuildingPlan:
 
 
 def sheets(
-    rect: Array,
+    rect: Float64Array,
     deep: float,
     frame: Frame,
     slot: int,
@@ -63,7 +64,7 @@ def sheets(
     return quads(panels(rect, deep, frame), slot)
 
 
-def panels(rect: Array, deep: float, frame: Frame) -> Array:
+def panels(rect: Float64Array, deep: float, frame: Frame) -> Float64Array:
     """(n, 4, 3) corners of ``sheets``."""
     origin, along, inward = frame
     base = origin + deep * inward
@@ -74,7 +75,7 @@ def panels(rect: Array, deep: float, frame: Frame) -> Array:
     return corners
 
 
-def reveals(rect: Array, deep: float, frame: Frame) -> Mesh:
+def reveals(rect: Float64Array, deep: float, frame: Frame) -> Mesh:
     """The sides of rectangular recesses (n, 4: u0, u1, z0, z1), ``deep`` metres deep."""
     front = panels(rect, 0.0, frame)
     back = panels(rect, deep, frame)
@@ -89,7 +90,7 @@ def wall_around(
     width: float,
     low: float,
     high: float,
-    holes: Array,
+    holes: Float64Array,
     frame: Frame,
 ) -> Mesh:
     """A wall with rectangular holes (n, 4: u0, u1, z0, z1), as a grid of rectangles between the
@@ -104,7 +105,7 @@ def wall_around(
     return sheets(cells[~inside.all(2).any(1)], 0.0, frame, WALL)
 
 
-def _make_bars(rect: Array, depth: float, frame: Frame) -> Mesh:
+def _make_bars(rect: Float64Array, depth: float, frame: Frame) -> Mesh:
     """The left, right, middle and lower bars of the frames of windows."""
     u0, u1, z0, z1 = rect.T
     middle = (u0 + u1) / 2
@@ -117,7 +118,7 @@ def _make_bars(rect: Array, depth: float, frame: Frame) -> Mesh:
     return merge([sheets(np.stack(bar, 1), depth, frame, FRAME) for bar in bars])
 
 
-def _windows(rect: Array, frame: Frame, rng: Rng) -> Mesh:
+def _windows(rect: Float64Array, frame: Frame, rng: Rng) -> Mesh:
     """Recessed windows: glass, frames and sills, with a blind in front of the glass or a curtain
     behind it."""
     count = len(rect)
@@ -144,7 +145,7 @@ def _openings(
     width: float,
     front: bool,
     rng: Rng,
-) -> tuple[Array, Array]:
+) -> tuple[Float64Array, Float64Array]:
     """Sampled rectangles (n, 4: u0, u1, z0, z1) of the windows and of the doors of a facade."""
     count = max(1, int(width / rng.uniform(2.3, 3.3)))
     pitch = width / count
@@ -199,7 +200,7 @@ def facade(
     return merge(parts)
 
 
-def _entrance(doors: Array, plinth: float, frame: Frame) -> list[Mesh]:
+def _entrance(doors: Float64Array, plinth: float, frame: Frame) -> list[Mesh]:
     """Doors and the steps in front of them."""
     steps = doors + np.array((-0.3, 0.3, 0, 0))
     steps[:, 2:] = -0.3, plinth - 0.02

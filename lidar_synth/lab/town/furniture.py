@@ -5,9 +5,10 @@ The front of a sign is along +x, as is the arm of a lamp; walls and fences run a
 
 import numpy as np
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.town.catalogue import RGB, TABLES, Rng, pick_colour
 from lidar_synth.lab.town.materials import Finish
-from lidar_synth.lab.town.meshes import Array, boxes, circle, fan, quads, tube, tubes
+from lidar_synth.lab.town.meshes import boxes, circle, fan, quads, tube, tubes
 from lidar_synth.lab.town.objects import StaticObject, make_object
 from lidar_synth.lab.town.plants import random_plant
 
@@ -44,7 +45,7 @@ def planter(rng: Rng) -> StaticObject:
     return make_object("planter", mesh, finishes=dict(enumerate(bush.finishes)))
 
 
-def _outline(shape: str, *measures: float) -> Array:
+def _outline(shape: str, *measures: float) -> Float64Array:
     """(P, 2) left and up of the corners of a board, metres."""
     if shape == "regular":
         sides, radius = measures
@@ -66,7 +67,7 @@ def road_sign(kind: str, height: float) -> StaticObject:
     return make_object("sign", *parts, finishes=colours)
 
 
-def _post_places(length: float) -> Array:
+def _post_places(length: float) -> Float64Array:
     """Places of the posts of a fence, about 2.5 m apart."""
     step = max(1.0, length / max(1, round(length / 2.5)))
     return np.arange(0, length + 0.01, step)

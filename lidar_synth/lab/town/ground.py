@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lidar_synth.geometry.arrays import Float64Array, Int32Array
 from lidar_synth.lab.town.catalogue import TABLES, Rng
 from lidar_synth.lab.town.course import Course, Relief
 from lidar_synth.lab.town.materials import Finish, read_finishes
-from lidar_synth.lab.town.meshes import Array, Ints, Mesh, merge, quads
+from lidar_synth.lab.town.meshes import Mesh, merge, quads
 from lidar_synth.lab.town.street import LEFT, RIGHT
 
 Rect = tuple[float, float, float, float, int]
@@ -101,14 +102,14 @@ class TownGround:
         for (s0, s1), (t0, t1), kind in zip(along, across, ends[:, 4], strict=True):
             self._kinds[s0:s1, t0:t1] = int(kind)
 
-    def kind(self, s: ArrayLike, t: ArrayLike) -> Ints:
+    def kind(self, s: ArrayLike, t: ArrayLike) -> Int32Array:
         """Index in ``NAMES`` of the ground at street coordinates (rounded corners count as
         square)."""
         return np.asarray(self._kinds[_below(self._s, s), _below(self._t, t)])
 
     def height(
         self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None
-    ) -> Array:
+    ) -> Float64Array:
         """Height at street coordinates, metres: of the ground there, or of the given kind of ground
         instead."""
         lift = _LIFT[self.kind(s, t) if kind is None else np.asarray(kind)]
@@ -118,7 +119,7 @@ class TownGround:
 
     def points(
         self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None
-    ) -> Array:
+    ) -> Float64Array:
         """(..., 3) world coordinates of the ground's surface at street coordinates, metres."""
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
         return np.concatenate(
@@ -146,7 +147,7 @@ class TownGround:
             ]
         )
 
-    def _roughness(self, picks: list[tuple[slice, slice]], rng: Rng) -> Array:
+    def _roughness(self, picks: list[tuple[slice, slice]], rng: Rng) -> Float64Array:
         """Random heights of the grid's points that have unpaved ground on all sides, metres."""
         rough = np.zeros((len(self._s), len(self._t)), bool)
         rough[1:-1, 1:-1] = True
@@ -187,8 +188,8 @@ class TownGround:
 
     def _sheet(
         self,
-        outer: Array,
-        inner: Array,
+        outer: Float64Array,
+        inner: Float64Array,
         low: int,
         kind: int,
     ) -> Mesh:
@@ -199,15 +200,15 @@ class TownGround:
         return quads(np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1), kind)
 
 
-def _below(lines: Array, values: ArrayLike) -> Ints:
+def _below(lines: Float64Array, values: ArrayLike) -> Int32Array:
     """Index of the last line that is not above each value, within the cells."""
     found = np.searchsorted(lines, values, "right") - 1
     return np.asarray(np.clip(found, 0, len(lines) - 2))
 
 
 def _lines(
-    edges: Array, reach: tuple[float, float], fine: tuple[float, float]
-) -> Array:
+    edges: Float64Array, reach: tuple[float, float], fine: tuple[float, float]
+) -> Float64Array:
     """Grid lines along one axis: all edges, and lines between them at most 3 m apart, wider outside
     ``fine``."""
     low, high = reach
@@ -223,11 +224,13 @@ def _lines(
     return np.concatenate(lines)
 
 
-def _middles(lines: Array) -> Array:
+def _middles(lines: Float64Array) -> Float64Array:
     return (lines[:-1] + lines[1:]) / 2
 
 
-def _steps(cells: Array, kinds: Ints, hole: NDArray[np.bool_]) -> Iterator[Mesh]:
+def _steps(
+    cells: Float64Array, kinds: Int32Array, hole: NDArray[np.bool_]
+) -> Iterator[Mesh]:
     """Vertical faces between neighbouring cells of different height, along each axis."""
     along = (np.s_[:-1, :], np.s_[1:, :], [1, 2], [0, 3])
     across = (np.s_[:, :-1], np.s_[:, 1:], [3, 2], [0, 1])

@@ -15,12 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lidar_synth.geometry.arrays import Float32Array, Float64Array, Int32Array
 from lidar_synth.lab.town.catalogue import Rng
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int32]
-Slots = int | Ints
+Slots = int | Int32Array
 
 
 @dataclass(frozen=True)
@@ -32,8 +30,8 @@ class Mesh:
         slot: (F,) int32.
     """
 
-    triangles: Floats
-    slot: Ints
+    triangles: Float32Array
+    slot: Int32Array
 
     def __len__(self) -> int:
         return len(self.slot)
@@ -49,30 +47,32 @@ class Mesh:
         scaled = self.triangles * np.asarray(scale, np.float32)
         return self._turned(scaled, turn, offset)
 
-    def posed(self, pose: Array) -> "Mesh":
+    def posed(self, pose: Float64Array) -> "Mesh":
         """The mesh transformed by a rigid motion (4, 4)."""
         turn = pose[:3, :3].T.astype(np.float32)
         return self._turned(self.triangles, turn, pose[:3, 3])
 
-    def _turned(self, triangles: Floats, turn: Floats, offset: ArrayLike) -> "Mesh":
+    def _turned(
+        self, triangles: Float32Array, turn: Float32Array, offset: ArrayLike
+    ) -> "Mesh":
         points = triangles.reshape(-1, 3) @ turn + np.asarray(offset, np.float32)
         return Mesh(points.reshape(-1, 3, 3), self.slot)
 
     @cached_property
-    def bounds(self) -> tuple[Floats, Floats]:
+    def bounds(self) -> tuple[Float32Array, Float32Array]:
         """Lowest and highest corner, each (3,) metres."""
         points = self.triangles.reshape(-1, 3)
         return points.min(0), points.max(0)
 
     @cached_property
-    def sphere(self) -> tuple[Floats, float]:
+    def sphere(self) -> tuple[Float32Array, float]:
         """Centre (3,) and radius of a sphere around it, metres."""
         low, high = self.bounds
         middle = np.asarray((low + high) / 2, np.float32)
         return middle, float(np.linalg.norm(high - low)) / 2
 
     @cached_property
-    def outline(self) -> Floats:
+    def outline(self) -> Float32Array:
         """(P, 3) extreme corners in 160 directions, which approximate the convex hull for image
         boxes."""
         angle = np.pi * (1 + 5**0.5) * np.arange(160)
@@ -80,7 +80,7 @@ class Mesh:
         flat = np.sqrt(1 - up * up)
         points = self.triangles.reshape(-1, 3)
         ways = np.stack([flat * np.cos(angle), flat * np.sin(angle), up])
-        outermost: Floats = points[np.unique((points @ ways).argmax(0))]
+        outermost: Float32Array = points[np.unique((points @ ways).argmax(0))]
         return outermost
 
 
@@ -98,7 +98,7 @@ def merge(parts: Iterable[Mesh]) -> Mesh:
     )
 
 
-def _slots(slot: Slots, *shape: int) -> Ints:
+def _slots(slot: Slots, *shape: int) -> Int32Array:
     if isinstance(slot, int):
         return np.full(math.prod(shape), slot, np.int32)
     return np.broadcast_to(np.asarray(slot, np.int32), shape).ravel()
@@ -162,13 +162,13 @@ def fan(outline: ArrayLike, slot: int = 0) -> Mesh:
     return Mesh(triangles, _slots(slot, len(triangles)))
 
 
-def circle(sides: int) -> Array:
+def circle(sides: int) -> Float64Array:
     """(sides, 2) the corners of a regular polygon on the unit circle."""
     angle = 2 * np.pi * np.arange(sides) / sides
     return np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
-def sphere(rings: int, sides: int) -> Array:
+def sphere(rings: int, sides: int) -> Float64Array:
     """(rings + 1, sides, 3) points on the unit sphere, from its top to its bottom."""
     polar = np.linspace(0, np.pi, rings + 1)[:, None]
     x, y = circle(sides).T
@@ -209,14 +209,14 @@ def _cross(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     return np.stack(across, 1)
 
 
-def _rings(axes: Array, sides: int) -> Array:
+def _rings(axes: Float64Array, sides: int) -> Float64Array:
     """(K, sides, 3) unit circles perpendicular to K axes (K, 3)."""
     ahead = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     steep = np.abs(ahead[:, 2:]) >= 0.9
     across = _cross(ahead, np.where(steep, (1, 0, 0), (0, 0, 1)))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     x, y = circle(sides).T[..., None]
-    ring: Array = x * across[:, None] + y * _cross(ahead, across)[:, None]
+    ring: Float64Array = x * across[:, None] + y * _cross(ahead, across)[:, None]
     return ring
 
 

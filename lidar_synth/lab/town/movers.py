@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidar_synth.lab.town.meshes import Array, Ints
+from lidar_synth.geometry.arrays import Float64Array, Int32Array
 from lidar_synth.lab.town.objects import Prototype
 from lidar_synth.lab.town.scene import PlacedObject, Pose, Scene
 from lidar_synth.lab.town.street import LEFT, REACH, RIGHT, Street
@@ -47,7 +47,7 @@ class Mover:
     stride: float
     line: Line
     instance: int
-    surfaces: Ints
+    surfaces: Int32Array
     scale: float
 
     def place(self, time: float) -> tuple[float, float, float]:
@@ -113,7 +113,7 @@ def ego_pose(
     scene: Scene,
     time: float,
     height: float,
-    sway: Array,
+    sway: Float64Array,
 ) -> Pose:
     """(4, 4) sensor to world at a time in seconds.
 

@@ -18,10 +18,10 @@ from tqdm import tqdm
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry import Boxes, Scan, Sensor, load_sensor
+from lidar_synth.geometry.arrays import Float32Array, Float64Array
 from lidar_synth.lab.town.boxes import box_values
 from lidar_synth.lab.town.cast import MISS, SceneHits, Snapshot
 from lidar_synth.lab.town.materials import SurfaceTable
-from lidar_synth.lab.town.meshes import Array, Floats
 from lidar_synth.lab.town.objects import Prototype
 from lidar_synth.lab.town.returns import measure, see_through
 from lidar_synth.lab.town.town import Town
@@ -49,8 +49,8 @@ class _Alone(Snapshot):
         c = np.cos(box[6])
         s = np.sin(box[6])
         self._prototype = prototype
-        self._scale: Floats = (box[3:6] / (high - low)).astype(np.float32)
-        self._turn: Floats = np.array(
+        self._scale: Float32Array = (box[3:6] / (high - low)).astype(np.float32)
+        self._turn: Float32Array = np.array(
             [
                 [c, -s, 0],
                 [s, c, 0],
@@ -59,20 +59,20 @@ class _Alone(Snapshot):
             np.float32,
         )
         middle = self._turn @ (self._scale * (low + high) / 2)
-        self._shift: Floats = (box[:3] - middle).astype(np.float32)
+        self._shift: Float32Array = (box[:3] - middle).astype(np.float32)
 
     def cast(
         self,
-        origins: Floats,
-        directions: Floats,
-        eye: Floats | None = None,
+        origins: Float32Array,
+        directions: Float32Array,
+        eye: Float32Array | None = None,
     ) -> SceneHits:
         """The first hit of each ray; surfaces are slots of the mesh."""
         local = origins - self._shift
-        start: Floats = np.asarray(local @ self._turn / self._scale, np.float32)
+        start: Float32Array = np.asarray(local @ self._turn / self._scale, np.float32)
         # A distance in multiples of the direction is the same before and after stretching.
         way = directions @ self._turn / self._scale
-        ways: Floats = np.asarray(way, np.float32)
+        ways: Float32Array = np.asarray(way, np.float32)
         distance, face, normal = self._prototype.solid.first(start, ways)
         surface = np.where(face >= 0, self._prototype.mesh.slot[face], MISS)
         turned = (normal / self._scale) @ self._turn.T
@@ -124,7 +124,7 @@ class ObjectCaster(Town):
         )
 
     @cached_property
-    def _around(self) -> tuple[NDArray[np.intp], Floats]:
+    def _around(self) -> tuple[NDArray[np.intp], Float32Array]:
         """The rays twice in the order of their azimuths, and these azimuths, from -pi to 3 pi."""
         azimuth = np.arctan2(self._rays[:, 1], self._rays[:, 0])
         order = np.argsort(azimuth, kind="stable")
@@ -206,8 +206,8 @@ class TownObjects(ObjectBank):
 
 
 def _choose(
-    found: list[tuple[TownShape, Array]], classes: Any
-) -> list[tuple[str, TownShape, Array]]:
+    found: list[tuple[TownShape, Float64Array]], classes: Any
+) -> list[tuple[str, TownShape, Float64Array]]:
     """The objects of some classes by name; None for all that KITTI has a name for."""
     named = [(name, *pair) for pair in found for name in _names(pair[0].prototype)]
     known = {name for name, _, _ in named}

@@ -11,18 +11,10 @@ from functools import cache
 
 import numpy as np
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.town.catalogue import TABLES, Rng
 from lidar_synth.lab.town.materials import Finish
-from lidar_synth.lab.town.meshes import (
-    Array,
-    Mesh,
-    circle,
-    leaves,
-    loft,
-    merge,
-    sphere,
-    tube,
-)
+from lidar_synth.lab.town.meshes import Mesh, circle, leaves, loft, merge, sphere, tube
 from lidar_synth.lab.town.objects import StaticObject, make_object
 
 LEAF = 0
@@ -35,7 +27,7 @@ SPECIES = TABLES["plants"]
 """The species by name."""
 
 
-def _stem(height: float, radius: float, rng: Rng) -> tuple[Mesh, Array]:
+def _stem(height: float, radius: float, rng: Rng) -> tuple[Mesh, Float64Array]:
     """A slightly crooked trunk that widens at its foot, and its path (5, 3)."""
     levels = np.array([-0.2, 0.12, 0.45, 0.5 * height, height])
     lean = np.cumsum(rng.normal(0, 0.05, (5, 2)), axis=0) * (levels[:, None] > 0.2)
@@ -43,7 +35,7 @@ def _stem(height: float, radius: float, rng: Rng) -> tuple[Mesh, Array]:
     return tube(path, radius * np.array([1.7, 1.25, 1.0, 0.9, 0.75]), 8, BARK), path
 
 
-def _branches(foot: Array, ends: Array, radius: float) -> Mesh:
+def _branches(foot: Float64Array, ends: Float64Array, radius: float) -> Mesh:
     """Branches from ``foot`` (3,) to each of ``ends`` (K, 3)."""
     radii = [radius, 0.6 * radius, 0.02]
     return merge(
@@ -53,8 +45,8 @@ def _branches(foot: Array, ends: Array, radius: float) -> Mesh:
 
 
 def _leaf_clusters(
-    centres: Array,
-    spread: Array | float,
+    centres: Float64Array,
+    spread: Float64Array | float,
     count: int,
     size: float,
     rng: Rng,
@@ -65,7 +57,7 @@ def _leaf_clusters(
     return leaves(middle, size * rng.uniform(0.6, 1.3, len(middle)), rng, LEAF)
 
 
-def _blob(centre: Array, radius: float, rng: Rng) -> Mesh:
+def _blob(centre: Float64Array, radius: float, rng: Rng) -> Mesh:
     """A dense part of a crown: an uneven ball."""
     ball = radius * sphere(4, 6) * rng.normal(1, 0.2, (5, 6, 1))
     return loft(centre + ball, CORE, closed=True)
@@ -77,13 +69,13 @@ def _ellipsoid_points(
     height: float,
     middle: float,
     rng: Rng,
-) -> Array:
+) -> Float64Array:
     """(count, 3) points near the surface of an ellipsoid with semi-axes ``width`` and ``height``
     whose centre is ``middle`` metres above the origin."""
     out = rng.standard_normal((count, 3))
     deep = rng.uniform(0.55, 1.0, (count, 1)) ** 0.6
     out *= deep / np.linalg.norm(out, axis=1, keepdims=True)
-    points: Array = out * (width, width, height) + (0, 0, middle)
+    points: Float64Array = out * (width, width, height) + (0, 0, middle)
     return points
 
 
@@ -179,7 +171,7 @@ def coarse_plant(species: str, variant: int) -> Mesh:
     )
 
 
-def _sample_tint(species: str, rng: Rng) -> Array:
+def _sample_tint(species: str, rng: Rng) -> Float64Array:
     """(3,) factors of the colour of leaves; some bushes are red."""
     tint = rng.uniform(0.8, 1.25) * rng.uniform(0.9, 1.1, 3)
     if species == "bush" and rng.random() < 0.2:
@@ -258,7 +250,7 @@ def _grow_hedge(
     return merge([loft(core, 1), *ends, foliage])
 
 
-def _sample_points(core: Array, count: int, rng: Rng) -> Array:
+def _sample_points(core: Float64Array, count: int, rng: Rng) -> Float64Array:
     """(count, 3) random points on the surface through the cross-sections (S, P, 3) of a hedge."""
     steps, columns, _ = core.shape
     row = rng.integers(0, steps - 1, count)
@@ -278,7 +270,7 @@ def _hedge_core(
     profile: str,
     growth: float,
     rng: Rng,
-) -> Array:
+) -> Float64Array:
     """(S, P, 3) the cross-sections of the core of a hedge."""
     across, up = np.array(TABLES["hedges"][profile]).T
     steps = max(3, int(length / 0.6) + 1)

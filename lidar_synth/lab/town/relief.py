@@ -5,7 +5,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
+from lidar_synth.geometry.arrays import Float32Array
+
 SIZES = (0.12, 0.4, 1.3)
 """Metres, cell sizes of the octaves."""
 WEIGHTS = (0.45, 0.7, 1.0)
@@ -32,10 +33,10 @@ def _corner(
 
 @njit(cache=True)
 def _noise(
-    points: Floats,
+    points: Float32Array,
     sizes: NDArray[np.float64],
     weights: NDArray[np.float64],
-    out: Floats,
+    out: Float32Array,
 ) -> None:
     for i in range(len(points)):
         total = 0.0
@@ -66,7 +67,7 @@ def _noise(
         out[i] = total
 
 
-def sample_relief(points: Floats) -> Floats:
+def sample_relief(points: Float32Array) -> Float32Array:
     """(N,) displacement at points (N, 3) of the world in metres, with mean 0 and standard deviation
     1."""
     out = np.empty(len(points), np.float32)

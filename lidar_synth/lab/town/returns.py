@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry import Sensor
+from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.lab.town.cast import SceneHits, Snapshot
 from lidar_synth.lab.town.catalogue import TABLES, Rng
 from lidar_synth.lab.town.materials import SurfaceTable, column
-from lidar_synth.lab.town.meshes import Floats
 from lidar_synth.lab.town.relief import sample_relief
 
 CALIBRATED_ON = (
@@ -77,7 +77,7 @@ class ReturnNoise:
     threshold: float = 0.0045
 
 
-def laser_gains(sensor: Sensor, noise: ReturnNoise) -> Floats:
+def laser_gains(sensor: Sensor, noise: ReturnNoise) -> Float32Array:
     """(H,) gain of each laser, the same for every scan of a sensor; a few lasers are weak."""
     if not noise.gain_std:
         return np.ones(sensor.shape[0], np.float32)
@@ -87,7 +87,7 @@ def laser_gains(sensor: Sensor, noise: ReturnNoise) -> Floats:
     return np.clip(gains, 0.4, 1.4).astype(np.float32)
 
 
-def cell_noise(points: Floats, size: float) -> Floats:
+def cell_noise(points: Float32Array, size: float) -> Float32Array:
     """(N,) pseudo-random values, uniform in [0, 1), one per cube of ``size`` metres in which the
     points (N, 3) lie.
 
@@ -108,7 +108,7 @@ def cell_noise(points: Floats, size: float) -> Floats:
 def see_through(
     snapshot: Snapshot,
     hits: SceneHits,
-    eye: Floats,
+    eye: Float32Array,
     surfaces: SurfaceTable,
     rng: Rng,
 ) -> None:
@@ -133,10 +133,10 @@ def measure(
     hits: SceneHits,
     laser: NDArray[np.intp],
     surfaces: SurfaceTable,
-    gains: Floats,
+    gains: Float32Array,
     noise: ReturnNoise,
     rng: Rng,
-) -> tuple[NDArray[np.intp], Floats, Floats]:
+) -> tuple[NDArray[np.intp], Float32Array, Float32Array]:
     """Sample which rays return, and their range and reflectance.
 
     Args:
@@ -177,9 +177,9 @@ def _measure_range(
     hits: SceneHits,
     rays: NDArray[np.intp],
     material: NDArray[np.uint8],
-    slope: Floats,
-    gaussian: Floats,
-) -> Floats:
+    slope: Float32Array,
+    gaussian: Float32Array,
+) -> Float32Array:
     """(K,) metres to soft and rough surfaces, which lie before or behind their triangle."""
     behind = _ROUGHNESS[material] * gaussian[0] * np.exp(_TAIL * gaussian[1])
     soft = np.flatnonzero(_RELIEF[material])
@@ -191,18 +191,20 @@ def _measure_range(
 
 
 def _return_probability(
-    power: Floats,
-    facing: Floats,
-    distance: Floats,
+    power: Float32Array,
+    facing: Float32Array,
+    distance: Float32Array,
     noise: ReturnNoise,
-) -> Floats:
+) -> Float32Array:
     """(N,) probability that the signal of a hit exceeds the sensor's threshold."""
     spreading = np.minimum(1, 900 / np.maximum(distance * distance, 1))
     signal = power * np.minimum(1, facing * 9) * spreading + np.float32(0.002)
     return np.asarray(signal**2 / (signal**2 + np.float32(noise.threshold) ** 2))
 
 
-def _response(power: Floats, slope: Floats, distance: Floats) -> Floats:
+def _response(
+    power: Float32Array, slope: Float32Array, distance: Float32Array
+) -> Float32Array:
     """(N,) the reflectance that the sensor gives for a reflected power, 0 and more, without
     noise."""
     place = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1)

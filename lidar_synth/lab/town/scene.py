@@ -9,13 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lidar_synth.geometry.arrays import Float64Array, Int32Array
 from lidar_synth.lab.town.catalogue import RGB
 from lidar_synth.lab.town.ground import TownGround
 from lidar_synth.lab.town.materials import Finishes
-from lidar_synth.lab.town.meshes import Array, Ints, Mesh, merge
+from lidar_synth.lab.town.meshes import Mesh, merge
 from lidar_synth.lab.town.objects import Prototype, StaticObject
 
-Pose = Array
+Pose = Float64Array
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class PlacedObject:
     prototype: Prototype
     pose: Pose
     instance: int
-    surfaces: Ints
+    surfaces: Int32Array
     scale: float = 1.0
 
 
@@ -61,7 +62,7 @@ class Scene:
     footprints: list[tuple[float, float, float, float]] = field(default_factory=list)
     instances: int = 0
 
-    def add_mesh(self, mesh: Mesh, surfaces: Ints) -> None:
+    def add_mesh(self, mesh: Mesh, surfaces: Int32Array) -> None:
         """Add a mesh in world coordinates; ``surfaces`` holds the surface number of each slot."""
         self.meshes.append(Mesh(mesh.triangles, surfaces[mesh.slot]))
 
@@ -138,7 +139,7 @@ class Scene:
 
     def add_instance(
         self, prototype: Prototype, colour: RGB, moving: bool
-    ) -> tuple[int, Ints]:
+    ) -> tuple[int, Int32Array]:
         """Register a new instance; return its number and the surface number of each slot."""
         self.instances += 1
         raw = prototype.raw[int(moving)]

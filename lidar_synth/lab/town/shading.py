@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.lab.town.camera import CAMERA, all_pixels, pixel_rays
 from lidar_synth.lab.town.cast import MISS, SceneHits, Snapshot
 from lidar_synth.lab.town.catalogue import Rng
 from lidar_synth.lab.town.materials import INDEX, SurfaceTable, column
-from lidar_synth.lab.town.meshes import Floats
 from lidar_synth.lab.town.returns import cell_noise
 from lidar_synth.lab.town.scene import Pose
 
@@ -39,7 +39,7 @@ class Light:
         cloud: cloud cover, 0..1.
     """
 
-    sun: Floats
+    sun: Float32Array
     direct: float
     ambient: float
     cloud: float
@@ -56,7 +56,7 @@ def sample_light(rng: Rng) -> Light:
     return Light(np.array(sun, np.float32), direct, 0.55 + 0.45 * cloud, cloud)
 
 
-def sky(directions: Floats, light: Light) -> Floats:
+def sky(directions: Float32Array, light: Light) -> Float32Array:
     """(N, 3) linear RGB of the sky along unit vectors; overexposed at the horizon and near the sun,
     as in photos."""
     up = np.clip(directions[:, 2:], 0, 1)
@@ -72,14 +72,14 @@ def sky(directions: Floats, light: Light) -> Floats:
     return np.asarray(colour + light.direct * glare, np.float32)
 
 
-def _clouds(places: Floats, cover: float) -> Floats:
+def _clouds(places: Float32Array, cover: float) -> Float32Array:
     """(N, 1) how white clouds are at places (N, 2) of the sky, 0..1."""
     octaves = [_value_noise(places * k, k) / k for k in (1.5, 3.0, 6.0)]
     puffs = np.sum(octaves, axis=0)[:, None]
     return np.asarray(np.clip(2.2 * (puffs - 0.62 + 0.35 * cover), 0, 1))
 
 
-def _value_noise(places: Floats, layer: float) -> Floats:
+def _value_noise(places: Float32Array, layer: float) -> Float32Array:
     """(N,) value noise in 0..1 at points of the plane (N, 2); each ``layer`` is an independent
     pattern."""
     base = np.floor(places)
@@ -96,8 +96,8 @@ def _value_noise(places: Floats, layer: float) -> Floats:
 
 def camera_hits(
     snapshot: Snapshot,
-    eye: Floats,
-    directions: Floats,
+    eye: Float32Array,
+    directions: Float32Array,
     surfaces: SurfaceTable,
 ) -> SceneHits:
     """The first hits of camera rays: as ``Snapshot.cast``, but rays pass through the gaps of
@@ -124,10 +124,10 @@ they are seen."""
 
 
 def _darken_joints(
-    value: Floats,
-    place: Floats,
-    normal: Floats,
-    far: Floats,
+    value: Float32Array,
+    place: Float32Array,
+    normal: Float32Array,
+    far: Float32Array,
     material: NDArray[np.uint8],
 ) -> None:
     """Darken, in place, the joints between bricks, tiles and stones."""
@@ -140,11 +140,11 @@ def _darken_joints(
 
 
 def _texture(
-    place: Floats,
-    normal: Floats,
-    far: Floats,
+    place: Float32Array,
+    normal: Float32Array,
+    far: Float32Array,
     material: NDArray[np.uint8],
-) -> Floats:
+) -> Float32Array:
     """(N,) brightness factors of the texture, around 1: noise at two scales, no finer than a pixel,
     and the joints between bricks, tiles, stones and slabs."""
     size = np.float32(0.02) * 2 ** np.ceil(np.log2(np.maximum(far / 12, 1)))
@@ -160,11 +160,11 @@ def _texture(
 
 def shade(
     snapshot: Snapshot,
-    eye: Floats,
-    directions: Floats,
+    eye: Float32Array,
+    directions: Float32Array,
     surfaces: SurfaceTable,
     light: Light,
-) -> tuple[Floats, SceneHits]:
+) -> tuple[Float32Array, SceneHits]:
     """Linear RGB (N, 3) along camera rays, and their hits."""
     hits = camera_hits(snapshot, eye, directions, surfaces)
     image = np.empty_like(directions)
@@ -192,7 +192,9 @@ def shade(
     return image, hits
 
 
-def _facing(normal: Floats, material: NDArray[np.uint8], light: Light) -> Floats:
+def _facing(
+    normal: Float32Array, material: NDArray[np.uint8], light: Light
+) -> Float32Array:
     """(N,) share of the sunlight that surfaces reflect by their direction."""
     facing = normal @ light.sun
     # Light passes through foliage: both sides of its triangles are lit.
@@ -203,11 +205,11 @@ def _facing(normal: Floats, material: NDArray[np.uint8], light: Light) -> Floats
 
 def _lit(
     snapshot: Snapshot,
-    place: Floats,
-    normal: Floats,
-    facing: Floats,
+    place: Float32Array,
+    normal: Float32Array,
+    facing: Float32Array,
     light: Light,
-) -> Floats:
+) -> Float32Array:
     """(N,) 1 where the sun is seen from a place, 0 in the shadow."""
     lit = np.zeros(len(place), np.float32)
     if light.direct > 0.1:
@@ -219,11 +221,11 @@ def _lit(
 
 
 def _reflect(
-    shaded: Floats,
-    ray: Floats,
-    normal: Floats,
+    shaded: Float32Array,
+    ray: Float32Array,
+    normal: Float32Array,
     material: NDArray[np.uint8],
-    lit: Floats,
+    lit: Float32Array,
     light: Light,
 ) -> None:
     """Add, in place, reflections of sky and sun on glass and glossy paint; near the horizon they
@@ -273,13 +275,13 @@ def render(
     return tone_map(value)
 
 
-def _exposure(image: Floats) -> float:
+def _exposure(image: Float32Array) -> float:
     """The exposure factor that maps the median of the lower half of the image to a mid grey."""
     lower = image[len(image) // 2 :] @ np.array([0.3, 0.59, 0.11], np.float32)
     return float(np.clip(0.20 / max(float(np.median(lower)), 0.02), 0.6, 3.5))
 
 
-def tone_map(image: Floats) -> NDArray[np.uint8]:
+def tone_map(image: Float32Array) -> NDArray[np.uint8]:
     """Tone mapping: uint8 sRGB of exposed linear RGB, with soft clipping of highlights."""
     curve = np.clip(image, 0, None)
     soft = curve * (1 + 0.18 * curve) / (1 + 0.30 * curve)

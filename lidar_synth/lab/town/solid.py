@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import LibraryError
-
-Floats = NDArray[np.float32]
+from lidar_synth.geometry.arrays import Float32Array
 
 
 def load_embree() -> tuple[Any, Any]:
@@ -39,24 +38,24 @@ class Solid:
         LibraryError: if embreex is missing.
     """
 
-    def __init__(self, triangles: Floats) -> None:
+    def __init__(self, triangles: Float32Array) -> None:
         scene, mesh = load_embree()
         self._triangles = np.ascontiguousarray(triangles, np.float32)
         self._scene = scene()
         self._mesh = mesh(self._scene, self._triangles)
 
-    def __reduce__(self) -> tuple[type["Solid"], tuple[Floats]]:
+    def __reduce__(self) -> tuple[type["Solid"], tuple[Float32Array]]:
         return Solid, (self._triangles,)
 
     def first(
-        self, origins: Floats, directions: Floats
-    ) -> tuple[Floats, NDArray[np.int32], Floats]:
+        self, origins: Float32Array, directions: Float32Array
+    ) -> tuple[Float32Array, NDArray[np.int32], Float32Array]:
         """Distance (inf = no hit), triangle (-1 = no hit) and normal (not unit) of the first hit of
         each ray."""
         out = self._scene.run(
             np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1
         )
         face: NDArray[np.int32] = out["primID"]
-        distance: Floats = out["tfar"]
+        distance: Float32Array = out["tfar"]
         distance[face < 0] = np.inf
         return distance, face, out["Ng"]

@@ -17,13 +17,13 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import json_checksum
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.geometry import SYNTHETIC, Scan, Sensor, load_sensor
+from lidar_synth.geometry.arrays import Float32Array, Int32Array
 from lidar_synth.lab.town.boxes import boxes_of
 from lidar_synth.lab.town.camera import CAMERA
 from lidar_synth.lab.town.cast import SceneHits, Snapshot
 from lidar_synth.lab.town.catalogue import TABLES_HASH, Rng
 from lidar_synth.lab.town.ego import HEIGHT, free_rays, point_rays
 from lidar_synth.lab.town.materials import SurfaceTable
-from lidar_synth.lab.town.meshes import Floats, Ints
 from lidar_synth.lab.town.movers import ego_place, ego_pose, place_movers
 from lidar_synth.lab.town.returns import ReturnNoise, laser_gains, measure, see_through
 from lidar_synth.lab.town.scene import PlacedObject, Pose
@@ -264,7 +264,7 @@ class Town:
             provenance=self.provenance,
         )
 
-    def _travelled(self, index: int) -> Floats:
+    def _travelled(self, index: int) -> Float32Array:
         """(3,) metres that the ego vehicle drives during the revolution of a scan, in the world
         frame."""
         world = self.world(index)
@@ -281,10 +281,10 @@ class Town:
         self,
         snapshot: Snapshot,
         pose: Pose,
-        travelled: Floats,
+        travelled: Float32Array,
         surfaces: SurfaceTable,
         rng: Rng,
-    ) -> tuple[NDArray[np.intp], Ints, Floats, Floats]:
+    ) -> tuple[NDArray[np.intp], Int32Array, Float32Array, Float32Array]:
         """Ray, surface number, point in the sensor frame and reflectance of each return of one
         revolution.
 
@@ -308,7 +308,7 @@ class Town:
         self,
         snapshot: Snapshot,
         pose: Pose,
-        moved: Floats,
+        moved: Float32Array,
         surfaces: SurfaceTable,
         rng: Rng,
     ) -> SceneHits:
@@ -323,11 +323,11 @@ class Town:
     def _dress(
         self,
         rays: NDArray[np.intp],
-        points: Floats,
-        reflectance: Floats,
+        points: Float32Array,
+        reflectance: Float32Array,
         boxed: NDArray[np.bool_],
         rng: Rng,
-    ) -> tuple[Floats, NDArray[np.bool_]]:
+    ) -> tuple[Float32Array, NDArray[np.bool_]]:
         """Move returns along their rays as the skin does; their reflectance with it, and which of
         them are left, within the sensor's range."""
         kept = np.ones(len(rays), bool)

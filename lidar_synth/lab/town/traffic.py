@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.lab.town.bodies import PHASES, cyclist, motorcyclist, walker
 from lidar_synth.lab.town.catalogue import RGB, Rng, pick, pick_colour, pick_name
-from lidar_synth.lab.town.meshes import Array
 from lidar_synth.lab.town.movers import Line, Mover, ego_place
 from lidar_synth.lab.town.objects import Prototype
 from lidar_synth.lab.town.paving import PLAZA_DEPTH
@@ -23,9 +23,9 @@ from lidar_synth.lab.town.vehicles import vehicles
 def _track(
     shape: Prototype,
     line: Line,
-    times: Array,
+    times: Float64Array,
     gap: float,
-) -> Array:
+) -> Float64Array:
     """(T, 4) bounds (lowest s, highest s, lowest t, highest t) of a moving shape at each time,
     metres."""
     low, high = shape.mesh.bounds
@@ -36,15 +36,15 @@ def _track(
 
 
 def _bounds(
-    s: Array,
-    t: Array,
-    half_s: Array,
-    half_t: Array,
-) -> Array:
+    s: Float64Array,
+    t: Float64Array,
+    half_s: Float64Array,
+    half_t: Float64Array,
+) -> Float64Array:
     return np.stack([s - half_s, s + half_s, t - half_t, t + half_t], 1)
 
 
-def _ego_track(street: Street, times: Array) -> Array:
+def _ego_track(street: Street, times: Float64Array) -> Float64Array:
     """The track of the ego vehicle, 4.7 m long and 1.8 m wide, with a margin of 1.2 m."""
     s, t, yaw = np.array([ego_place(street, time) for time in times]).T
     along = np.abs(np.cos(yaw))
@@ -78,7 +78,7 @@ class Traffic:
         self,
         street: Street,
         scene: Scene,
-        times: Array,
+        times: Float64Array,
         rng: Rng,
     ) -> None:
         self._street = street
@@ -245,7 +245,7 @@ class Traffic:
             )
 
 
-def _overlap(a: Array, b: Array) -> bool:
+def _overlap(a: Float64Array, b: Float64Array) -> bool:
     """Whether two tracks (..., 4) overlap at any time."""
     s = (a[..., 0] < b[..., 1]) & (a[..., 1] > b[..., 0])
     t = (a[..., 2] < b[..., 3]) & (a[..., 3] > b[..., 2])

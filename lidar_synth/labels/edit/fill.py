@@ -15,9 +15,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.labels.edit.rays import ScanRays
-
-Floats = NDArray[np.float64]
 
 _compiled = numba.njit(cache=True)
 
@@ -48,11 +47,11 @@ _SMOOTH = 2  # rays to either side over which a distance is averaged
 def continue_surfaces(
     rays: ScanRays,
     hole: NDArray[np.bool_],
-    near: Floats,
-    far: Floats,
+    near: Float64Array,
+    far: Float64Array,
     ground: NDArray[np.bool_],
     thing: NDArray[np.bool_],
-) -> tuple[NDArray[np.int64], Floats]:
+) -> tuple[NDArray[np.int64], Float64Array]:
     """Continue the surfaces beside a hole.
 
     Args:
@@ -97,9 +96,9 @@ class _Ring(NamedTuple):
     step: float
     hole: NDArray[np.bool_]
     known: NDArray[np.bool_]
-    rho: Floats
-    near: Floats
-    far: Floats
+    rho: Float64Array
+    near: Float64Array
+    far: Float64Array
     ground: NDArray[np.bool_]
     thing: NDArray[np.bool_]
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import GROUND, TRAIN_ID
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Boxes, Scan, wrap_angle
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.overlap import find_overlapping
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.rays import rays_from
@@ -32,8 +33,6 @@ from lidar_synth.labels.edit.removal import remove, select_boxes
 from lidar_synth.labels.ground import FLOOR, ground_under
 from lidar_synth.labels.objects import Object, objects_of
 from lidar_synth.labels.pasting import still_visible, update_occlusion
-
-Floats = NDArray[np.float64]
 
 if TYPE_CHECKING:
     from lidar_synth.generate.generator import Generator
@@ -70,11 +69,11 @@ class Placed(NamedTuple):
         mirrored: whether its mirror image about its long axis is used.
     """
 
-    old: Floats
+    old: Float64Array
     box: NDArray[np.float32]
     mirrored: bool
 
-    def points(self, points: NDArray[np.float32]) -> Floats:
+    def points(self, points: NDArray[np.float32]) -> Float64Array:
         """(N, 3) recorded points at the new place, metres."""
         local = turn_points(points - self.old[:3], -self.old[6])
         if self.mirrored:
@@ -335,7 +334,7 @@ def _shared(scan: Scan, other: Scan) -> NDArray[np.bool_]:
     return np.isin(ours, theirs)
 
 
-def _complete(old: Floats, pose: Pose | None) -> tuple[float, float, float]:
+def _complete(old: Float64Array, pose: Pose | None) -> tuple[float, float, float]:
     """x, y and yaw of a pose."""
     values = [float(v) for v in (old[[0, 1, 6]] if pose is None else pose)]
     if len(values) not in (2, 3) or not np.isfinite(values).all():
@@ -349,7 +348,7 @@ def _complete(old: Floats, pose: Pose | None) -> tuple[float, float, float]:
     return values[0], values[1], values[2]
 
 
-def _mirrored(old: Floats, x: float, y: float, yaw: float) -> bool:
+def _mirrored(old: Float64Array, x: float, y: float, yaw: float) -> bool:
     """Whether the mirror image of an object shows the side that is seen at its new place.
 
     Raises:
@@ -370,7 +369,7 @@ def _mirrored(old: Floats, x: float, y: float, yaw: float) -> bool:
 
 def _hits(
     item: Object, placed: Placed, rays: ScanRays, window: NDArray[np.intp]
-) -> tuple[Floats, Hits, NDArray[np.intp]]:
+) -> tuple[Float64Array, Hits, NDArray[np.intp]]:
     """(n,) the horizontal distance at which each ray of the window hits the object, inf = never;
     all hits, and the index (n, 2) of each ray's."""
     rho = np.full(len(window), np.inf)
@@ -414,7 +413,9 @@ def _surfaces(part: Scan) -> ScanSurfaces:
     )
 
 
-def _behind(rays: ScanRays, window: NDArray[np.intp], rho: Floats) -> NDArray[np.bool_]:
+def _behind(
+    rays: ScanRays, window: NDArray[np.intp], rho: Float64Array
+) -> NDArray[np.bool_]:
     """(n,) rays of the window between two that hit the object in their ring, whose return lies
     behind it."""
     behind = np.zeros(len(window), bool)

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry import Scan
+from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.transfer.kernels import WIDEST
 from lidar_synth.geometry.transfer.surfaces import as_fired, rings_of
-
-Floats = NDArray[np.float64]
 
 
 class ScanRays(NamedTuple):
@@ -30,14 +29,14 @@ class ScanRays(NamedTuple):
 
     point: NDArray[np.int64]
     ring: NDArray[np.int64]
-    azimuth: Floats
-    slope: Floats
-    height: Floats
-    rho: Floats
+    azimuth: Float64Array
+    slope: Float64Array
+    height: Float64Array
+    rho: Float64Array
     start: NDArray[np.int64]
     step: float
 
-    def points(self, which: NDArray[np.intp], rho: Floats) -> NDArray[np.float32]:
+    def points(self, which: NDArray[np.intp], rho: Float64Array) -> NDArray[np.float32]:
         """(n, 3) points on some rays at horizontal distances (n,), metres."""
         azimuth = self.azimuth[which]
         z = self.height[which] + self.slope[which] * rho
@@ -52,7 +51,7 @@ class ScanRays(NamedTuple):
         wide = box + np.array([0, 0, 0, *sides, 0], np.float32)
         return np.asarray(self.leaving(wide) > 0)
 
-    def leaving(self, box: NDArray[np.float32]) -> Floats:
+    def leaving(self, box: NDArray[np.float32]) -> Float64Array:
         """(E,) horizontal distance at which each ray leaves a box (7,), metres; 0 = it does not
         pass through."""
         left = np.zeros(len(self.azimuth))

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry import Scan, Sensor, presets
+from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.geometry.projection import locate, project
 from lidar_synth.lab.evaluate.lidm import SENSOR
-
-Floats = NDArray[np.float32]
 
 CHANNELS = ("range", "x", "y", "z", "remission")
 """Channels of every image; metres, and reflectance in [0, 1]."""
@@ -34,11 +33,13 @@ class NetworkInputs(NamedTuple):
         cloud: ``(scan, generated) -> (N, 3)`` float32, metres.
     """
 
-    image: Callable[[Scan, bool], Floats]
-    cloud: Callable[[Scan, bool], Floats]
+    image: Callable[[Scan, bool], Float32Array]
+    cloud: Callable[[Scan, bool], Float32Array]
 
 
-def nearest_points(scan: Scan, sensor: Sensor) -> tuple[Floats, NDArray[np.int32]]:
+def nearest_points(
+    scan: Scan, sensor: Sensor
+) -> tuple[Float32Array, NDArray[np.int32]]:
     """(5, H, W) range, position and reflectance of the nearest point in each cell, 0 where there is
     none; and the index (H, W) of that point, -1 = none."""
     cells = locate(scan.points, sensor)
@@ -51,7 +52,7 @@ def nearest_points(scan: Scan, sensor: Sensor) -> tuple[Floats, NDArray[np.int32
     return image, cells.point
 
 
-def _r2flow_image(scan: Scan, generated: bool) -> Floats:
+def _r2flow_image(scan: Scan, generated: bool) -> Float32Array:
     """Returns from 0.5 m to 63 m, 0 elsewhere. Generated returns are put on rays through the cells'
     corners."""
     sensor = presets()["hdl64e_kitti360"]
@@ -62,23 +63,23 @@ def _r2flow_image(scan: Scan, generated: bool) -> Floats:
     return image
 
 
-def _r2flow_cloud(scan: Scan, generated: bool) -> Floats:
+def _r2flow_cloud(scan: Scan, generated: bool) -> Float32Array:
     image = _r2flow_image(scan, generated)
     return np.ascontiguousarray(image[1:4, image[0] > 0].T)
 
 
-def _lidm_cloud(scan: Scan, generated: bool) -> Floats:
+def _lidm_cloud(scan: Scan, generated: bool) -> Float32Array:
     """The returns of the range image on rays through the cells' corners, real or generated."""
     image = project(scan, SENSOR, ())
     xyz = (_corner_rays()[image.mask] * image.range[image.mask, None]).astype(
         np.float32
     )
     distance = np.linalg.norm(xyz, axis=1)
-    kept: Floats = xyz[(distance > NEAREST) & (distance < FURTHEST)]
+    kept: Float32Array = xyz[(distance > NEAREST) & (distance < FURTHEST)]
     return kept
 
 
-def _lidm_image(scan: Scan, generated: bool) -> Floats:
+def _lidm_image(scan: Scan, generated: bool) -> Float32Array:
     """The cloud projected again, as in LiDM's evaluation; -1 where there is no return, remission
     unknown.
 
@@ -100,7 +101,7 @@ def _lidm_image(scan: Scan, generated: bool) -> Floats:
     return _on_corner_rays(depth, np.full_like(depth, -1))
 
 
-def _r3dpa_image(scan: Scan, generated: bool) -> Floats:
+def _r3dpa_image(scan: Scan, generated: bool) -> Float32Array:
     """Range and position -1 and remission 0 where there is no return; returns on rays through the
     cells' corners."""
     image = project(scan, SENSOR, ("reflectance",))
@@ -109,7 +110,7 @@ def _r3dpa_image(scan: Scan, generated: bool) -> Floats:
     )
 
 
-def _on_corner_rays(depth: Floats, remission: Floats) -> Floats:
+def _on_corner_rays(depth: Float32Array, remission: Float32Array) -> Float32Array:
     xyz = np.moveaxis(_corner_rays() * depth[..., None], -1, 0)
     xyz[:, ~((depth > NEAREST) & (depth < FURTHEST))] = -1
     return np.concatenate([depth[None], xyz, remission[None]]).astype(np.float32)

@@ -5,13 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Scan
-
-Floats = NDArray[np.float32]
+from lidar_synth.geometry.arrays import Float32Array
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,7 @@ class PerScan:
 
     describe: Callable[[Scan, bool], Tensor]
 
-    def __call__(self, scans: Sequence[Scan], generated: bool = False) -> Floats:
+    def __call__(self, scans: Sequence[Scan], generated: bool = False) -> Float32Array:
         """n scans to (n, D) features; see ``Extractor``.
 
         Raises:
@@ -36,9 +34,9 @@ class PerScan:
         with torch.inference_mode():
             return np.stack([self._row(scan, generated) for scan in scans])
 
-    def _row(self, scan: Scan, generated: bool) -> Floats:
+    def _row(self, scan: Scan, generated: bool) -> Float32Array:
         try:
-            row: Floats = self.describe(scan, generated).numpy()
+            row: Float32Array = self.describe(scan, generated).numpy()
         except DataError as error:
             raise DataError(f"scan {scan.id!r}: {error}") from error
         if not np.isfinite(row).all():
@@ -49,7 +47,7 @@ class PerScan:
         return row
 
 
-def some(points: Floats | Tensor) -> int:
+def some(points: Float32Array | Tensor) -> int:
     """The number of returns; a protocol needs at least one.
 
     Raises:

@@ -17,10 +17,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lidar_synth.geometry.arrays import Float32Array, Int64Array
 from lidar_synth.lab.proof.detection.boxes import CLASSES
-
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float32]
 
 REACH = 51.2
 """Metres from the sensor to each of the four sides of the view."""
@@ -60,14 +58,14 @@ class Target(NamedTuple):
 class Found:
     """Detected boxes: (D, 7) boxes as ``Boxes.values``, (D,) scores from 0 to 1, (D,) classes."""
 
-    boxes: Floats
-    scores: Floats
-    classes: Integers
+    boxes: Float32Array
+    scores: Float32Array
+    classes: Int64Array
 
 
 def view(
-    points: Floats,
-    reflectance: Floats,
+    points: Float32Array,
+    reflectance: Float32Array,
 ) -> Tensor:
     """(n, n, CHANNELS) uint8: a scan of N points from above, x along the first axis."""
     image = np.zeros((CELLS * CELLS, SLICES + 2), np.uint8)
@@ -95,8 +93,8 @@ def _fill(image, count, points, reflectance):  # type: ignore[no-untyped-def]
 
 
 def targets(
-    boxes: Floats,
-    classes: Integers,
+    boxes: Float32Array,
+    classes: Int64Array,
     pixel: float,
 ) -> Target:
     """The targets of M boxes (M, 7) with classes (M,); pixels have sides of ``pixel`` metres."""
@@ -129,8 +127,8 @@ def targets(
 
 def _offsets(
     centre: NDArray[np.float64],
-    rows: Integers,
-    columns: Integers,
+    rows: Int64Array,
+    columns: Int64Array,
 ) -> list[NDArray[np.float64]]:
     """From the middle of each pixel to a centre, in pixels: along the rows and along the
     columns."""
@@ -177,7 +175,7 @@ def decode(
 
 
 def _apart(
-    places: Floats,
+    places: Float32Array,
     distance: float,
 ) -> list[int]:
     """The places (D, 2) in order, without those within a distance of an earlier one."""
@@ -191,7 +189,7 @@ def _apart(
 def boxes_at(
     index: Tensor,
     values: Tensor,
-) -> Floats:
+) -> Float32Array:
     """(D, 7) boxes that the pixels with these flat indices hold."""
     count = values.shape[-1]
     found = values.flatten(1)[:, index].double().numpy()

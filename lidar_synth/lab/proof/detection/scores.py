@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry import Scan
+from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.geometry.overlap import footprints
 from lidar_synth.lab.proof.detection.bev import REACH, Found
 from lidar_synth.lab.proof.detection.boxes import (
@@ -20,8 +21,6 @@ from lidar_synth.lab.proof.detection.boxes import (
     detected,
     points_in,
 )
-
-Floats = NDArray[np.float32]
 
 OVERLAP = (0.5, 0.25, 0.25)
 """Minimum intersection over union of the footprints of cars, pedestrians and cyclists."""
@@ -32,7 +31,7 @@ class Truth:
     """The boxes of a tested scan: (M, 7), classes (M,), and whether each has to be found (M,). The
     others, with fewer than ``LEAST`` returns or outside the view, may be found."""
 
-    boxes: Floats
+    boxes: Float32Array
     classes: NDArray[np.int64]
     wanted: NDArray[np.bool_]
 
@@ -63,8 +62,8 @@ class Criterion:
 
     def fit(
         self,
-        boxes: Floats,
-        truth: Floats,
+        boxes: Float32Array,
+        truth: Float32Array,
     ) -> NDArray[np.float64]:
         """(D, M) how well boxes (D, 7) fit others (M, 7); 1 and more is right."""
         if self.overlap:
@@ -72,7 +71,7 @@ class Criterion:
         apart = _distances(boxes, truth)
         return np.asarray(self.distance / np.maximum(apart, 1e-9), np.float64)
 
-    def includes(self, boxes: Floats) -> NDArray[np.bool_]:
+    def includes(self, boxes: Float32Array) -> NDArray[np.bool_]:
         """(M,) whether boxes (M, 7) are within the limits of distance."""
         away = np.hypot(*boxes[:, :2].T)
         return np.asarray((self.near <= away) & (away < self.far))
@@ -82,7 +81,7 @@ class Judged(NamedTuple):
     """The detections of a class that count, in some scans: (D,) scores and (D,) 1 for right ones;
     and the number of boxes that have to be found."""
 
-    scores: Floats
+    scores: Float32Array
     hits: NDArray[np.int64]
     wanted: int
 
@@ -129,7 +128,7 @@ def precisions(
 
 def matched(
     fit: NDArray[np.float64],
-    scores: Floats,
+    scores: Float32Array,
     wanted: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
     """(D,) 1 for a right detection, 0 for a wrong one, -1 for one that does not count: of a box
@@ -152,15 +151,15 @@ def matched(
     return result
 
 
-def _distances(a: Floats, b: Floats) -> NDArray[np.float64]:
+def _distances(a: Float32Array, b: Float32Array) -> NDArray[np.float64]:
     """(A, B) distances between the centres of boxes (A, 7) and (B, 7) on the ground."""
     x, y = (a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1)
     return np.asarray(np.hypot(x, y))
 
 
 def footprint_ious(
-    a: Floats,
-    b: Floats,
+    a: Float32Array,
+    b: Float32Array,
 ) -> NDArray[np.float64]:
     """(A, B) intersection over union of the footprints of boxes (A, 7) and (B, 7)."""
     ious = np.zeros((len(a), len(b)))

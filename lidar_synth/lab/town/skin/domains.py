@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Scan, Sensor
+from lidar_synth.geometry.arrays import Float32Array, Int32Array
 from lidar_synth.geometry.projection import laser_rows
 from lidar_synth.geometry.transfer.surfaces import as_fired
 from lidar_synth.lab.town.catalogue import Rng
@@ -18,8 +19,6 @@ from lidar_synth.lab.town.skin.features import (
     KINDS,
     ROUGH,
     STRATA,
-    Floats,
-    Ints,
     RayFeatures,
     find_features,
     find_strata,
@@ -43,9 +42,9 @@ class Returns(NamedTuple):
     """
 
     found: RayFeatures
-    points: Floats
-    bright: Floats
-    rows: Ints
+    points: Float32Array
+    bright: Float32Array
+    rows: Int32Array
     boxed: NDArray[np.bool_]
 
 
@@ -115,8 +114,8 @@ class Domain:
     """
 
     scans: list[Returns]
-    cuts: Floats
-    strata: list[Ints]
+    cuts: Float32Array
+    strata: list[Int32Array]
 
     @classmethod
     def of(cls, scans: list[Returns]) -> "Domain":

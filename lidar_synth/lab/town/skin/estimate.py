@@ -9,14 +9,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from lidar_synth.geometry import Sensor
+from lidar_synth.geometry.arrays import Float32Array, Int32Array
 from lidar_synth.lab.town.skin.domains import PART_LEVELS, STRATUM_LEVELS, Domain
 from lidar_synth.lab.town.skin.features import (
     BAND,
     BANDS,
     STRATA,
     STRATUM_KIND,
-    Floats,
-    Ints,
     find_features,
 )
 from lidar_synth.lab.town.skin.skin import MEANS, RESIDUALS, Skin, part_of
@@ -33,7 +32,7 @@ _LARGEST_FACTOR = 5.0
 BAND_LEVELS = [np.arange(BANDS), np.zeros(BANDS, np.int64)]
 LEVELS = {"mean": BAND_LEVELS, "residual": PART_LEVELS, "range": STRATUM_LEVELS}
 
-Pair = tuple[Floats, NDArray[np.integer]]
+Pair = tuple[Float32Array, NDArray[np.integer]]
 
 
 def estimate_skin(
@@ -73,7 +72,7 @@ def estimate_skin(
 
 
 def _tables(
-    domain: Domain, offset: Floats, quantiles: Floats | None = None
+    domain: Domain, offset: Float32Array, quantiles: Float32Array | None = None
 ) -> dict[str, Pair]:
     """Values and groups of the local mean, the residual of reflectance and that of range."""
     mean = np.concatenate(
@@ -95,7 +94,7 @@ def _tables(
     }
 
 
-def _both(name: str, town: Pair, real: Pair) -> tuple[Floats, Floats]:
+def _both(name: str, town: Pair, real: Pair) -> tuple[Float32Array, Float32Array]:
     """The quantiles of the town and the real ones."""
     count = MEANS if name == "mean" else RESIDUALS
     one, other = pool_quantiles([town, real], LEVELS[name], count)
@@ -148,7 +147,7 @@ def _collect_differences(domain: Domain, kind: int) -> Pair:
     return np.concatenate(difference), np.concatenate(ring)
 
 
-def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
+def laser_offsets(domain: Domain, rows: int, kind: int) -> Float32Array:
     """(rows,) reflectance of each laser on one kind of surface, beyond that of its neighbours.
 
     It is the sum of the median differences between neighbouring rings on the same surface, less its
@@ -162,13 +161,13 @@ def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
     )
 
 
-def _collect_gaps(domain: Domain) -> tuple[Ints, Ints]:
+def _collect_gaps(domain: Domain) -> tuple[Int32Array, Int32Array]:
     """Stratum and gap of each return."""
     gaps = [s.found.gap for s in domain.scans]
     return np.concatenate(domain.strata), np.concatenate(gaps)
 
 
-def missing(real: Domain, town: Domain, rows: int) -> tuple[Floats, Floats]:
+def missing(real: Domain, town: Domain, rows: int) -> tuple[Float32Array, Float32Array]:
     """Probability of a return to be missing between returns of a surface, beyond that of the town.
 
     Returns:
@@ -187,7 +186,7 @@ def missing(real: Domain, town: Domain, rows: int) -> tuple[Floats, Floats]:
     )
 
 
-def _rate(stratum: Ints, gap: Ints) -> NDArray[np.float64]:
+def _rate(stratum: Int32Array, gap: Int32Array) -> NDArray[np.float64]:
     """(STRATA,) share of missing returns among the firings between returns of one surface."""
     rate = np.zeros(STRATA)
     open_ = np.ones(STRATA, bool)

@@ -8,12 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from lidar_synth.geometry import Sensor
-
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int32]
+from lidar_synth.geometry.arrays import Float32Array, Int32Array
 
 RANGES = np.array([4, 7, 10, 14, 20, 28, 40, 55], np.float32)
 """Metres, limits between the bins of range."""
@@ -60,18 +57,18 @@ class RayFeatures(NamedTuple):
             otherwise 0.
     """
 
-    mean: Floats
-    residual: Floats
-    roughness: Floats
-    cell: Ints
-    below: Ints
-    gap: Ints
+    mean: Float32Array
+    residual: Float32Array
+    roughness: Float32Array
+    cell: Int32Array
+    below: Int32Array
+    gap: Int32Array
 
 
 def find_features(
-    points: Floats,
-    reflectance: Floats,
-    ring: Ints,
+    points: Float32Array,
+    reflectance: Float32Array,
+    ring: Int32Array,
     sensor: Sensor,
 ) -> RayFeatures:
     """Compute the features of a scan.
@@ -99,7 +96,7 @@ def find_features(
     return RayFeatures(mean, residual, rough, cell, below, gap)
 
 
-def ground_height(z: Floats, level: Floats, kind: Ints) -> np.float32:
+def ground_height(z: Float32Array, level: Float32Array, kind: Int32Array) -> np.float32:
     """Metres, height of the road below the sensor: the most frequent height of level surfaces
     within 15 m."""
     near = z[(kind == 0) & (level > 3) & (level < 15) & (np.abs(z) < 5)]
@@ -110,7 +107,7 @@ def ground_height(z: Floats, level: Floats, kind: Ints) -> np.float32:
     return np.float32((np.argmax(smooth) + 1.5) / 20 - 5)
 
 
-def find_strata(found: RayFeatures, cuts: Floats) -> Ints:
+def find_strata(found: RayFeatures, cuts: Float32Array) -> Int32Array:
     """(N,) stratum of each return, by its cell and the rank of its roughness.
 
     Args:
@@ -121,7 +118,7 @@ def find_strata(found: RayFeatures, cuts: Floats) -> Ints:
 
 
 @njit(cache=True)
-def _apart(turn: Floats, i: int, j: int, firings: int) -> float:
+def _apart(turn: Float32Array, i: int, j: int, firings: int) -> float:
     """Firings between two returns of a ring."""
     step = abs(turn[j] - turn[i])
     return float(min(step, firings - step))
@@ -129,12 +126,12 @@ def _apart(turn: Floats, i: int, j: int, firings: int) -> float:
 
 @njit(cache=True)
 def _along(
-    ring: Ints,
-    turn: Floats,
-    distance: Floats,
-    reflectance: Floats,
+    ring: Int32Array,
+    turn: Float32Array,
+    distance: Float32Array,
+    reflectance: Float32Array,
     firings: int,
-) -> tuple[Floats, Floats, Ints]:
+) -> tuple[Float32Array, Float32Array, Int32Array]:
     """Mean reflectance, residual of the range, and gap of each return."""
     count = len(ring)
     mean = np.empty(count, np.float32)
@@ -168,7 +165,7 @@ def _along(
 
 
 @njit(cache=True)
-def _roughness(ring: Ints, residual: Floats) -> Floats:
+def _roughness(ring: Int32Array, residual: Float32Array) -> Float32Array:
     count = len(ring)
     out = np.empty(count, np.float32)
     for i in range(count):
@@ -186,14 +183,14 @@ def _roughness(ring: Ints, residual: Floats) -> Floats:
 
 @njit(cache=True)
 def _across(
-    ring: Ints,
-    turn: Floats,
-    distance: Floats,
-    level: Floats,
-    z: Floats,
+    ring: Int32Array,
+    turn: Float32Array,
+    distance: Float32Array,
+    level: Float32Array,
+    z: Float32Array,
     rows: int,
     firings: int,
-) -> tuple[Ints, Ints]:
+) -> tuple[Int32Array, Int32Array]:
     """Kind of each return, and the return below it on the same surface."""
     count = len(ring)
     table = np.full((rows, firings), -1, np.int32)
@@ -220,7 +217,7 @@ def _across(
 
 
 @njit(cache=True)
-def _nearest(table: Ints, row: int, column: int) -> int:
+def _nearest(table: Int32Array, row: int, column: int) -> int:
     """The return of a ring at most two firings away, -1 if there is none."""
     if 0 <= row < len(table):
         for offset in (0, 1, -1, 2, -2):
@@ -231,7 +228,9 @@ def _nearest(table: Ints, row: int, column: int) -> int:
 
 
 @njit(cache=True)
-def _cells(distance: Floats, kind: Ints, height: Floats) -> Ints:
+def _cells(
+    distance: Float32Array, kind: Int32Array, height: Float32Array
+) -> Int32Array:
     out = np.empty(len(distance), np.int32)
     for i in range(len(distance)):
         a = np.searchsorted(RANGES, distance[i], side="right")
@@ -241,7 +240,9 @@ def _cells(distance: Floats, kind: Ints, height: Floats) -> Ints:
 
 
 @njit(cache=True)
-def _strata(cell: Ints, roughness: Floats, cuts: Floats) -> Ints:
+def _strata(
+    cell: Int32Array, roughness: Float32Array, cuts: Float32Array
+) -> Int32Array:
     out = np.empty(len(cell), np.int32)
     for i in range(len(cell)):
         rank = 0

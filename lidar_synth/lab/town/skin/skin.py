@@ -18,6 +18,7 @@ from safetensors.numpy import load, save
 from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.files.disk import read_file, write_file
 from lidar_synth.geometry import Sensor
+from lidar_synth.geometry.arrays import Float32Array, Int32Array
 from lidar_synth.lab.town.skin.features import (
     BAND,
     BANDS,
@@ -26,8 +27,6 @@ from lidar_synth.lab.town.skin.features import (
     ROUGH,
     STRATA,
     STRATUM_KIND,
-    Floats,
-    Ints,
     RayFeatures,
     find_features,
     find_strata,
@@ -87,8 +86,8 @@ class Dressed(NamedTuple):
         kept: (N,) bool, which points return.
     """
 
-    shift: Floats
-    reflectance: Floats
+    shift: Float32Array
+    reflectance: Float32Array
     kept: NDArray[np.bool_]
 
 
@@ -116,7 +115,7 @@ class Skin:
     sensor: Sensor
     step: float
     provenance: dict[str, Any]
-    arrays: dict[str, Floats]
+    arrays: dict[str, Float32Array]
 
     def __post_init__(self) -> None:
         expected = shapes(self.sensor.shape[0])
@@ -140,7 +139,7 @@ class Skin:
         return Skin, (self.sensor, self.step, self.provenance, self.arrays)
 
     @cached_property
-    def _maps(self) -> tuple[Floats, Floats, Floats]:
+    def _maps(self) -> tuple[Float32Array, Float32Array, Float32Array]:
         a = self.arrays
         return (
             lookup(a["mean_town"], a["mean_real"], _GRID),
@@ -172,8 +171,8 @@ class Skin:
 
     def apply(
         self,
-        points: Floats,
-        reflectance: Floats,
+        points: Float32Array,
+        reflectance: Float32Array,
         ring: NDArray[np.integer],
         boxed: NDArray[np.bool_],
         rng: np.random.Generator,
@@ -204,11 +203,11 @@ class Skin:
     def dress(
         self,
         found: RayFeatures,
-        stratum: Ints,
-        bright: Floats,
-        rows: Ints,
+        stratum: Int32Array,
+        bright: Float32Array,
+        rows: Int32Array,
         boxed: NDArray[np.bool_],
-        uniform: Floats,
+        uniform: Float32Array,
     ) -> Dressed:
         """``apply`` with features and random numbers (N,) that are at hand."""
         a = self.arrays
@@ -294,7 +293,9 @@ class Skin:
         )
 
 
-def part_of(mean: Floats, stratum: Ints, quantiles: Floats) -> NDArray[np.int64]:
+def part_of(
+    mean: Float32Array, stratum: Int32Array, quantiles: Float32Array
+) -> NDArray[np.int64]:
     """(N,) stratum and part of each return: the rank of its local mean among the quantiles (BANDS,
     MEANS)."""
     cuts = quantiles[:, _part_quantiles()]
@@ -307,7 +308,7 @@ def _part_quantiles() -> NDArray[np.intp]:
 
 
 @njit(cache=True)
-def _at(table: Floats, row: int, x: float) -> float:
+def _at(table: Float32Array, row: int, x: float) -> float:
     """The value of a table's row at x in [0, 1], between its grid points."""
     place = min(max(x, 0.0), 1.0) * (table.shape[1] - 1)
     low = min(int(place), table.shape[1] - 2)
@@ -326,23 +327,23 @@ def _root(x: float) -> float:
 
 @njit(cache=True)
 def _dress(
-    mean: Floats,
-    residual: Floats,
-    stratum: Ints,
-    bright: Floats,
-    ring: Ints,
+    mean: Float32Array,
+    residual: Float32Array,
+    stratum: Int32Array,
+    bright: Float32Array,
+    ring: Int32Array,
     boxed: NDArray[np.bool_],
-    uniform: Floats,
-    cuts: Floats,
-    to_mean: Floats,
-    to_residual: Floats,
-    to_range: Floats,
-    offset: Floats,
-    missing: Floats,
-    missing_laser: Floats,
+    uniform: Float32Array,
+    cuts: Float32Array,
+    to_mean: Float32Array,
+    to_residual: Float32Array,
+    to_range: Float32Array,
+    offset: Float32Array,
+    missing: Float32Array,
+    missing_laser: Float32Array,
     step: float,
     middle: float,
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+) -> tuple[Float32Array, Float32Array, NDArray[np.bool_]]:
     count = len(mean)
     shift = np.zeros(count, np.float32)
     value = np.empty(count, np.float32)

@@ -6,18 +6,19 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
+from lidar_synth.geometry.arrays import Float32Array
+
 FEWEST = 400
 """Values of a group in both domains from which its own quantiles are taken; smaller groups use
 coarser ones."""
 
 
 def grouped_quantiles(
-    value: Floats,
+    value: Float32Array,
     group: NDArray[np.integer],
     groups: int,
     count: int,
-) -> tuple[Floats, Floats]:
+) -> tuple[Float32Array, Float32Array]:
     """Quantiles of values by group.
 
     Args:
@@ -45,7 +46,7 @@ def grouped_quantiles(
     )
 
 
-def _sorted_in_groups(value: Floats, group: NDArray[np.integer]) -> Floats:
+def _sorted_in_groups(value: Float32Array, group: NDArray[np.integer]) -> Float32Array:
     """(N,) the values in the order of groups, ascending within each; by one sort of integers, which
     is fast."""
     bits = np.ascontiguousarray(value, np.float32).view(np.uint32)
@@ -62,10 +63,10 @@ def _sorted_in_groups(value: Floats, group: NDArray[np.integer]) -> Floats:
 
 
 def pool_quantiles(
-    pairs: Sequence[tuple[Floats, NDArray[np.integer]]],
+    pairs: Sequence[tuple[Float32Array, NDArray[np.integer]]],
     levels: Sequence[NDArray[np.integer]],
     count: int,
-) -> list[Floats]:
+) -> list[Float32Array]:
     """Quantiles of several domains by group, where a group with few values takes those of a coarser
     one.
 
@@ -93,7 +94,9 @@ def pool_quantiles(
     return tables
 
 
-def lookup(source: Floats, target: Floats, grid: Floats) -> Floats:
+def lookup(
+    source: Float32Array, target: Float32Array, grid: Float32Array
+) -> Float32Array:
     """(G, len(grid)) images of the values of ``grid`` by the map from quantiles (G, Q) to quantiles
     (G, Q).
 
