@@ -13,6 +13,16 @@ from difflib import get_close_matches
 from typing import TypeVar
 
 Choice = TypeVar("Choice")
+MISFITS = (
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    RuntimeError,
+    ArithmeticError,
+    SyntaxError,
+)
+"""What values of other kinds than expected cause."""
 
 
 class LidarSynthError(Exception):
@@ -116,3 +126,24 @@ def needs(extra: str, what: str, otherwise: str = "") -> Iterator[None]:
             f"the extra {extra}",
             f"pip install 'lidar_synth[{extra}]'{otherwise}",
         ) from error
+
+
+@contextmanager
+def parsing(what: object, expected: str = "", hint: str = "") -> Iterator[None]:
+    """Say what was read if its values are not as expected; errors that say so already pass.
+
+    Args:
+        what: the path, or a description.
+        expected: what a valid one holds.
+        hint: what the user can type or change.
+
+    Raises:
+        DataError: if a key is missing, or a value is of another kind or outside its interval.
+    """
+    try:
+        yield
+    except MISFITS as error:
+        if isinstance(error, DataError) and str(what) in str(error):
+            raise
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        raise DataError(f"{what}: {kind}{error}", expected, hint) from error

@@ -194,7 +194,7 @@ def test_outcomes_are_sealed(tmp_path: Path) -> None:
         assert not _is_there(path, read_outcome)
     assert not path.exists()
     path.write_bytes(seal({"table": "x"}))
-    with pytest.raises(DataError, match="is damaged"):
+    with pytest.raises(DataError, match="the outcome of a training"):
         read_outcome(path)
 
 

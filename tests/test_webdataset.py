@@ -268,7 +268,7 @@ def damaged(path: Path, **members: bytes | None) -> None:
 @pytest.mark.parametrize(
     ("members", "message"),
     [
-        ({"json": b"{"}, "JSONDecodeError"),
+        ({"json": b"{"}, "Expecting property name"),
         ({"json": b"{}"}, "KeyError.*names"),
         ({"points_npy": None}, "KeyError.*points"),
         ({"points_npy": b"no"}, "points.npy has no header of an .npy file"),

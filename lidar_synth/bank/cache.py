@@ -4,19 +4,15 @@ A copy is a whole shard, named by its SHA-256, which is checked. One process at 
 is copied and makes a file of the copy's size, which is locked until it is complete, so that all
 processes of a machine together fetch each shard once, and the limit holds.
 
-What a process and its workers read next, ``MixedScans`` announces for each epoch: a *plan*, a file
-that is locked as long as its process lives. A table has the time when each shard was last read.
-From both every process knows which copies are behind all plans. These make room for what is
-planned, the one that was read last first: plans that go through a bank in the same order come back
-to it last. A shard that is read now also takes the place of one that is not needed until it is
-done. Where there is no room, or only for a shard of which most scans are not planned, scans are
-read one by one from the URL.
+What a process and its workers read next, ``MixedScans`` announces for each epoch as a plan (see
+``plans``). Copies behind all plans make room for what is planned, the one that was read last first:
+plans that go through a bank in the same order come back to it last. A shard that is read now also
+takes the place of one that is not needed until it is done. Where there is no room, or only for a
+shard of which most scans are not planned, scans are read one by one from the URL.
 """
 
-import json
 import os
 import re
-import secrets
 import shutil
 import time
 from collections import deque
@@ -33,21 +29,14 @@ from numpy.typing import NDArray
 
 from lidar_synth.bank.folder import LocalFolder, check_copy, copy_files
 from lidar_synth.bank.index import Entry, Index
+from lidar_synth.bank.plans import Use, needed, published, uses_of
 from lidar_synth.bank.storage import LocalFile, RemoteFile, Storage
 from lidar_synth.errors import ConfigError, FileError, LidarSynthError
 from lidar_synth.files.disk import remove_file, writing
-from lidar_synth.files.lock import lock_alone, one_writer, try_lock
+from lidar_synth.files.lock import lock_alone, one_writer
 
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 _PAUSE = 0.2  # seconds until a plan looks for room again
-
-
-class Use(NamedTuple):
-    """What a plan reads of a shard: the positions of the first and last scan, and their number."""
-
-    first: int
-    last: int
-    scans: int
 
 
 class ShardCache:
@@ -173,7 +162,7 @@ class ShardCache:
             self._plan.join()
         with self._alone():
             self._parts()
-            self._needed()  # removes plans of dead processes
+            needed(self.folder)  # removes plans of dead processes
             for path in (*map(self._path, self.index.shards), self._table):
                 remove_file(path)
             if {path.name for path in self.folder.iterdir()} == {"lock"}:
@@ -237,11 +226,11 @@ class ShardCache:
 
     def _reserve(self, entry: Entry, now: bool, parts: list[Path]) -> "_Claim | None":
         name = self._path(entry).name
-        needed = self._needed()
-        use = needed.get(name)
+        planned = needed(self.folder)
+        use = planned.get(name)
         if use is None or 2 * use.scans < entry.kept:
             use = None  # the shard is not worth what it would displace
-        spare = self._spare(needed, use, now) if use else []
+        spare = self._spare(planned, use, now) if use else []
         if not self._make_room(entry.bytes, spare, parts):
             if use:
                 raise _NoRoomYet
@@ -270,14 +259,14 @@ class ShardCache:
                     parts.append(part)
         return parts
 
-    def _spare(self, needed: dict[str, Use], use: Use, now: bool) -> list[str]:
+    def _spare(self, planned: dict[str, Use], use: Use, now: bool) -> list[str]:
         """The copies that may be dropped for a planned shard, in this order: those that are not
         needed; for one that is read now also those that are not needed until it is done."""
         held = [path.name for path in self.folder.glob("*.h5")]
-        spare = sorted((n for n in held if n not in needed), key=self._last_read)
+        spare = sorted((n for n in held if n not in planned), key=self._last_read)
         if now:
-            later = [n for n in held if n in needed and needed[n].first > use.last]
-            spare += sorted(later, key=lambda name: -needed[name].first)
+            later = [n for n in held if n in planned and planned[n].first > use.last]
+            spare += sorted(later, key=lambda name: -planned[name].first)
         return spare
 
     def _make_room(self, size: int, spare: list[str], parts: list[Path]) -> bool:
@@ -297,23 +286,6 @@ class ShardCache:
         were read last."""
         number = self._numbers.get(name)
         return -inf if number is None else -float(self._times[number])
-
-    def _needed(self) -> dict[str, Use]:
-        """The copies that plans of living processes still need."""
-        needed: dict[str, Use] = {}
-        for path in self.folder.glob("*.plan"):
-            with try_lock(path) as dead:
-                if dead:
-                    remove_file(path)
-                else:
-                    for name, use in _read_plan(path).items():
-                        other = needed.get(name, Use(use.first, use.last, 0))
-                        needed[name] = Use(
-                            min(use.first, other.first),
-                            max(use.last, other.last),
-                            use.scans + other.scans,
-                        )
-        return needed
 
 
 class _Claim(NamedTuple):
@@ -345,24 +317,13 @@ class _Plan(Thread):
         self.ended = Event()
         self._cache = cache
         self._since = time.time_ns()
+        uses = uses_of(shards)
+        self._order = list(uses)
+        names = [cache._path(cache.index.shards[n]).name for n in uses]
         self._held = ExitStack()
-        found, first, scans = np.unique(shards, return_index=True, return_counts=True)
-        last = len(shards) - 1 - np.unique(shards[::-1], return_index=True)[1]
-        order = np.argsort(first)
-        self._order: list[int] = found[order].tolist()
-        names = [cache._path(cache.index.shards[n]).name for n in self._order]
-        values = {
-            "times": cache._table.name,
-            "since": self._since,
-            "names": names,
-            "shards": self._order,
-            "uses": np.transpose((first, last, scans))[order].tolist(),
-        }
-        self._path = cache.folder / f"{secrets.token_hex(8)}.plan"
-        new = self._path.with_suffix(".new")
-        self._held.enter_context(one_writer(new))
-        new.write_text(json.dumps(values))
-        new.replace(self._path)
+        self._held.enter_context(
+            published(cache.folder, cache._table.name, self._since, names, uses)
+        )
 
     def run(self) -> None:
         with self._held:
@@ -370,7 +331,6 @@ class _Plan(Thread):
             with suppress(LidarSynthError, RuntimeError):
                 self._fetch_ahead()
             self.ended.wait()
-            self._path.unlink(missing_ok=True)
 
     def _fetch_ahead(self) -> None:
         while self._cache._times.max() < self._since:
@@ -380,21 +340,6 @@ class _Plan(Thread):
         late = self._cache.fetch(order)
         while late is not None and not self.ended.wait(_PAUSE):
             late = self._cache.fetch(chain([late], order))
-
-
-def _read_plan(path: Path) -> dict[str, Use]:
-    """The copies that a plan still needs: those whose last scan comes after the first one of the
-    last shard up to which all have been read."""
-    with suppress(OSError):  # ended meanwhile
-        plan = json.loads(path.read_text())
-        times = np.fromfile(path.with_name(plan["times"]), np.int64)
-        unread = np.append(times[plan["shards"]] < plan["since"], True)
-        uses = [Use(*use) for use in plan["uses"]]
-        begun = int(unread.argmax()) - 1
-        reached = uses[begun].first if begun >= 0 else 0
-        named = zip(plan["names"], uses, strict=True)
-        return {name: use for name, use in named if use.last >= reached}
-    return {}
 
 
 class _Copy(LocalFile):

@@ -9,7 +9,8 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-from lidar_synth.bank.index import Facts, Index
+from lidar_synth.bank.facts import Facts
+from lidar_synth.bank.index import Index
 from lidar_synth.files.hub import front_matter
 from lidar_synth.files.markdown import escape_markdown, list_facts
 

@@ -17,7 +17,8 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Protocol
 
-from lidar_synth.bank.index import REPAIR, Entry
+from lidar_synth.bank.facts import REPAIR
+from lidar_synth.bank.index import Entry
 from lidar_synth.bank.retries import keep_trying
 from lidar_synth.bank.storage import (
     RemoteFile,

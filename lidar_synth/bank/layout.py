@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.bank.chunks import FILTERS
-from lidar_synth.bank.index import SCAN_NUMBERS, Facts
+from lidar_synth.bank.facts import Facts
+from lidar_synth.bank.index import SCAN_NUMBERS
 from lidar_synth.bank.storage import RangedFile, Storage
 
 T = TypeVar("T")

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any, overload
 
 from lidar_synth.bank.cache import ShardCache
-from lidar_synth.bank.index import FORMAT, INDEX, REPAIR, SETTINGS, Facts, Index
+from lidar_synth.bank.facts import FORMAT, REPAIR, Facts
+from lidar_synth.bank.index import INDEX, SETTINGS, Index
 from lidar_synth.bank.shard import ShardReader
 from lidar_synth.bank.storage import RemoteFile, bank_root, open_storage
 from lidar_synth.errors import ConfigError, DataError, FileError

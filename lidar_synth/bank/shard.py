@@ -31,7 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.bank.chunks import checksum, filters, unpack
-from lidar_synth.bank.index import FORMAT, REPAIR, Entry, Facts
+from lidar_synth.bank.facts import FORMAT, REPAIR, Facts
+from lidar_synth.bank.index import Entry
 from lidar_synth.bank.layout import ShardLayout, read_attributes, read_layout, with_hdf5
 from lidar_synth.bank.storage import LocalFile, Storage
 from lidar_synth.errors import DataError, LidarSynthError

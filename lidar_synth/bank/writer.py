@@ -13,7 +13,8 @@ import h5py
 import numpy as np
 
 from lidar_synth.bank.chunks import checksum, deflate, filters
-from lidar_synth.bank.index import Entry, Facts
+from lidar_synth.bank.facts import Facts
+from lidar_synth.bank.index import Entry
 from lidar_synth.bank.layout import metadata_size
 from lidar_synth.errors import DataError, FileError, LibraryError
 from lidar_synth.geometry import RangeImage

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import parsing
 
 KITTI360 = "KITTI-360"
 KITTI = "KITTI"
@@ -136,7 +136,9 @@ class Recordings:
         Raises:
             DataError: on values of another form.
         """
-        try:
+        with parsing(
+            f"recordings {str(values)[:200]}", "datasets, their drives and frames"
+        ):
             drives = {
                 (str(part["dataset"]), str(drive)): frames
                 for part in values
@@ -146,11 +148,6 @@ class Recordings:
                 if frames is not None:
                     drives[key] = _merged((int(a), int(b)) for a, b in frames)
             return cls(drives)
-        except (TypeError, KeyError, ValueError, AttributeError) as error:
-            raise DataError(
-                f"recordings {str(values)[:200]} ({error!r})",
-                "datasets, their drives and frames",
-            ) from error
 
 
 def all_frames(dataset: str, drives: Iterable[str]) -> Recordings:

@@ -24,7 +24,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, DataError, shorten
+from lidar_synth.errors import ConfigError, DataError, parsing, shorten
 from lidar_synth.files.disk import SKIP_HINT, STRAY, open_file, read_file, read_text
 
 if TYPE_CHECKING:
@@ -83,14 +83,8 @@ def parse_json(text: str | bytes, where: str, expected: str = "JSON") -> Any:
     Raises:
         DataError: if it is not JSON, or nested too deeply.
     """
-    try:
+    with parsing(f"{where} is not JSON", expected, SKIP_HINT):
         return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(
-            f"{where} is not JSON ({type(error).__name__}: {error})",
-            expected,
-            SKIP_HINT,
-        ) from error
 
 
 def read_facts(path: Path, expected: str) -> dict[str, Any]:

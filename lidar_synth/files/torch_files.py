@@ -61,16 +61,6 @@ _NUMBERS = {f"numpy.{core}.multiarray.scalar" for core in ("core", "_core")}
 _FAULTS = (*DAMAGED_ZIP, LookupError, TypeError, AttributeError, MemoryError)
 """What a damaged file causes: values of other kinds, and storages that are missing or short."""
 
-MISFITS = (
-    LookupError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    RuntimeError,
-    ArithmeticError,
-)
-"""What values of other kinds than expected cause, in a configuration or in tensors."""
-
 
 def load_pickle(path: Path, peer: str) -> Any:
     """The content of a ``.pth`` or ``.ckpt`` file.

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import SKIP_HINT, read_start
 from lidar_synth.formats.description import Description, from_comments
 from lidar_synth.formats.npz import TYPES
@@ -186,12 +186,8 @@ def from_text(
     lines = sum(1 for line in text.splitlines() if line.strip())
     if lines != count:
         raise size_error(where, lines, count, "lines")
-    try:
+    with parsing(where, f"{columns} numbers in each line", SKIP_HINT):
         table = np.loadtxt(io.StringIO(text), np.float64, comments=None, ndmin=2)
-    except ValueError as error:
-        raise DataError(
-            f"{where}: {error}", f"{columns} numbers in each line", SKIP_HINT
-        ) from error
     if table.shape != (count, columns):
         raise DataError(
             f"{where} has {table.shape[1]} values in a line",

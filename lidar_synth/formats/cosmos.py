@@ -24,7 +24,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, parsing
 from lidar_synth.files.disk import open_file, read_start, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.description import (
@@ -182,10 +182,8 @@ def _survey(path: Path) -> tuple[range, Description | None]:
     if text is None:
         return range(shape[1]), None
     where = f"{path}: its description"
-    try:
+    with parsing(where, "an intact file"):
         return range(shape[1]), Description.from_dict(parse_json(text, where))
-    except ValueError as error:
-        raise DataError(f"{where} is damaged ({error})", "an intact file") from error
 
 
 @contextmanager

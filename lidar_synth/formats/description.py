@@ -26,7 +26,7 @@ from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
-from lidar_synth.errors import ConfigError, DataError, shorten, suggest
+from lidar_synth.errors import ConfigError, parsing, shorten, suggest
 from lidar_synth.files.disk import read_start, read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.geometry import REAL, SYNTHETIC, Scan, Sensor, presets
@@ -249,17 +249,15 @@ def _is_dataset(folder: Path) -> bool:
 
 def _current(path: Path) -> Description:
     expected = f"a description of scans, of this package or yours ({FORMAT})"
-    try:
+    with parsing(
+        path,
+        expected,
+        "Restore it; or remove it (rename it, if it is another program's) and name the "
+        "sensor: --sensor (sensor=...).",
+    ):
         return Description.from_dict(
             parse_json(read_text(path, expected, LONGEST), str(path), expected)
         )
-    except ValueError as error:
-        raise DataError(
-            f"{path} is damaged ({error})",
-            expected,
-            "Restore it; or remove it (rename it, if it is another program's) and name the "
-            "sensor: --sensor (sensor=...).",
-        ) from error
 
 
 def record(root: Path, sensor: Sensor, origin: Origin) -> Description:
@@ -348,13 +346,7 @@ def from_comments(lines: Iterable[str], where: str) -> Description | None:
     if not parts:
         return None
     expected = f"a description of the scan that this package wrote ({FORMAT})"
-    try:
+    with parsing(f"{where}: its description", expected):
         return Description.from_dict(
             parse_json("".join(parts), f"{where}: its description", expected)
         )
-    except DataError:
-        raise
-    except ValueError as error:
-        raise DataError(
-            f"{where}: its description is damaged ({error})", expected
-        ) from error

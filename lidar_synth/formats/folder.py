@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, parsing
 from lidar_synth.files.disk import files_below, read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.formats.cloud import (
@@ -211,13 +211,11 @@ def read_boxes(path: Path) -> Boxes | None:
         return None
     expected = "the fields of Boxes, one value per box"
     given = parse_json(read_text(beside), str(beside), expected)
-    try:
+    with parsing(beside, expected):
         if not all(isinstance(name, str) for name in given["names"]):
             raise TypeError("names that are not text")
         with np.errstate(over="ignore"):  # Boxes refuses what is not finite
             return Boxes(**given)
-    except (TypeError, KeyError, ValueError, OverflowError) as error:
-        raise DataError(f"{beside}: {error!r}", expected) from error
 
 
 def write_boxes(path: Path, boxes: Boxes | None) -> None:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import MAX_INSTANCES
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import numbers, reading, write_file
 from lidar_synth.geometry import FARTHEST, Boxes
 from lidar_synth.geometry.arrays import Float64Array
@@ -144,7 +144,7 @@ def read_boxes(path: Path) -> WorldBoxes:
     instances = []
     windows = []
     annotated = set()
-    try:
+    with parsing(path, "KITTI-360's data_3d_bboxes"):
         with reading(path):
             for _, node in ElementTree.iterparse(path):
                 if node.find("transform") is None:
@@ -178,8 +178,6 @@ def read_boxes(path: Path) -> WorldBoxes:
             np.array(windows, np.int64).reshape(-1, 2),
             np.array(sorted(annotated), np.int64).reshape(-1, 2),
         )
-    except (ElementTree.ParseError, ValueError, LookupError, OverflowError) as error:
-        raise DataError(f"{path}: {error}", "KITTI-360's data_3d_bboxes") from error
     sizes = np.linalg.norm(found.transforms[:, :3, :3], axis=1)
     sound = np.isfinite(found.transforms).all(axis=(1, 2)) & (
         (sizes > 0) & (sizes <= FARTHEST)
@@ -246,19 +244,13 @@ def _read_others(path: Path, frames: Container[int]) -> ElementTree.Element:
     """What a file says about other frames; an empty root if there is no file."""
     if not path.is_file():
         return ElementTree.Element("opencv_storage")
-    try:
+    with parsing(path, "KITTI-360's data_3d_bboxes", "Remove it to write a new one."):
         with reading(path):
             root = ElementTree.parse(path).getroot()
         root[:] = [
             node for node in root if int(node.findtext("timestamp") or -1) not in frames
         ]
     # LookupError: an unknown encoding
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise DataError(
-            f"{path}: {error}",
-            "KITTI-360's data_3d_bboxes",
-            "Remove it to write a new one.",
-        ) from error
     return root
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import (
     numbers,
     read_matrix,
@@ -71,7 +71,7 @@ def read_calibration(root: Path) -> Calibration | None:
         return None
     matrices = read_named_matrices(paths[0]) | read_named_matrices(paths[2])
     matrices["cam_to_velo"] = read_matrix(paths[1], 12).reshape(-1)
-    try:
+    with parsing(folder, "P_rect_00, R_rect_00, S_rect_00, image_00 and 12 numbers"):
         if wrong := {
             name: matrices[name].size
             for name, size in SIZES.items()
@@ -87,11 +87,6 @@ def read_calibration(root: Path) -> Calibration | None:
         return Calibration(
             matrices["P_rect_00"].reshape(3, 4), camera_from_sensor, size, matrices
         )
-    except (KeyError, ValueError) as error:
-        raise DataError(
-            f"{folder}: {error!r}",
-            "P_rect_00, R_rect_00, S_rect_00, image_00 and 12 numbers",
-        ) from error
 
 
 def write_calibration(root: Path, camera: Calibration) -> None:

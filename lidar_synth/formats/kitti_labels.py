@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.geometry import FARTHEST, Boxes, wrap_angle
@@ -62,10 +62,8 @@ def _split_fields(text: str, path: Path) -> tuple[list[str], Float64Array]:
     bad = [row for row in rows if len(row) not in (15, 16)]
     if bad:
         raise DataError(f"{path}: a line with {len(bad[0])} fields", _FIELDS)
-    try:
+    with parsing(path, _FIELDS):
         values = np.array([row[1:15] for row in rows], np.float64).reshape(-1, 14)
-    except ValueError as error:
-        raise DataError(f"{path}: {error}", _FIELDS) from error
     return [row[0] for row in rows], values
 
 

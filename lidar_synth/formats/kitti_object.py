@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from lidar_synth.errors import ConfigError, DataError, choose
+from lidar_synth.errors import ConfigError, DataError, choose, parsing
 from lidar_synth.files.disk import (
     list_files,
     name_errors,
@@ -145,16 +145,11 @@ class KITTIObject(CameraBoxes):
             return None
         order = read_text(folder / "train_rand.txt").replace(",", " ").split()
         rows = read_text(folder / "train_mapping.txt").splitlines()
-        try:
+        with parsing(folder, "train_rand.txt and train_mapping.txt of the devkit"):
             found = {
                 f"training/{frame:06d}": rows[int(line) - 1].split()[1]
                 for frame, line in enumerate(order)
             }
-        except (ValueError, IndexError) as error:
-            raise DataError(
-                f"{folder}: {error}",
-                "train_rand.txt and train_mapping.txt of the devkit",
-            ) from error
         return tuple(found.get(name, name.partition("/")[0]) for name in self.ids)
 
     def _file(self, name: str, folder: str, suffix: str) -> Path:

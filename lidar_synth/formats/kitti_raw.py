@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import (
     list_files,
     name_errors,
@@ -151,7 +151,9 @@ def read_calibration(
     if not all(path.is_file() for path in paths):
         return None
     velo, cam = map(read_named_matrices, paths)
-    try:
+    with parsing(
+        f"{paths[0]} and {paths[1]}", "R and T; R_rect_00, P_rect_02 and S_rect_02"
+    ):
         to_cam_0 = homogeneous(
             np.column_stack([velo["R"].reshape(3, 3), velo["T"].reshape(3, 1)])
         )
@@ -159,11 +161,6 @@ def read_calibration(
         projection = cam["P_rect_02"].reshape(3, 4)
         size = image_size or read_image_size(cam["S_rect_02"], "S_rect_02")
         return Calibration(projection, rectify @ to_cam_0, size)
-    except (KeyError, ValueError) as error:
-        raise DataError(
-            f"{paths[0]} and {paths[1]}: {error}",
-            "R and T; R_rect_00, P_rect_02 and S_rect_02",
-        ) from error
 
 
 def read_tracklets(path: Path) -> dict[int, Boxes]:
@@ -179,7 +176,7 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
     rows: dict[int, list[tuple[tuple[float, ...], str, int, int, int]]] = defaultdict(
         list
     )
-    try:
+    with parsing(path, "KITTI's tracklet_labels.xml"):
         tracklets = ElementTree.fromstring(read_file(path)).findall("tracklets/item")
         for instance, tracklet in enumerate(tracklets):
             name = tracklet.findtext("objectType", "").translate(_IN_NAMES)
@@ -210,8 +207,6 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
                     )
                 )
     # LookupError: an unknown encoding
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise DataError(f"{path}: {error}", "KITTI's tracklet_labels.xml") from error
     boxes = {}
     for frame, found in sorted(rows.items()):
         values, names, occlusion, truncation, instances = zip(*found, strict=True)

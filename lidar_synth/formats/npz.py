@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, check_labels
-from lidar_synth.errors import DataError, LidarSynthError, shorten
+from lidar_synth.errors import DataError, LidarSynthError, parsing, shorten
 from lidar_synth.files.disk import SKIP_HINT, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.formats.description import check_provenance
@@ -128,11 +128,9 @@ def decode_scan(
     known: dict[str, Any] = to_stored(
         {n: a for n, a in arrays.items() if n in TYPES}, where
     )
-    try:
+    with parsing(where, expected):
         facts = _known(arrays, sensor) | ({} if sensor is None else {"sensor": sensor})
         return Scan(**known, **facts)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{where}: {error}", expected) from error
 
 
 def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -> None:
@@ -172,17 +170,13 @@ def decode_range_image(
         },
         where,
     )
-    try:
+    with parsing(where, "range and sensor of a range image"):
         facts = _known(arrays, sensor)
         if sensor is not None and sensor.shape != facts["sensor"].shape:
             raise ValueError(
                 f"it was made for sensor {facts['sensor'].name!r}, not for {sensor.name!r}"
             )
         return range_image(arrays["range"], facts["sensor"], channels, where), facts
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{where}: {error}", "range and sensor of a range image"
-        ) from error
 
 
 def range_image(

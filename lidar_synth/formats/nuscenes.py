@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import NUSCENES
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import (
     SKIP_HINT,
     join_inside,
@@ -164,7 +164,7 @@ def lidarseg_files(root: Path) -> Mapping[str, Path]:
     tables = sorted(root.glob("*/lidarseg.json"))
     complete = [t for t in tables if t.with_name("sample_data.json").is_file()]
     for table in complete or tables:
-        try:
+        with parsing(table, "nuScenes' tables lidarseg.json and sample_data.json"):
             samples, rows = (
                 _table(table.with_name(name))
                 for name in ("sample_data.json", table.name)
@@ -174,11 +174,6 @@ def lidarseg_files(root: Path) -> Mapping[str, Path]:
                 files[PurePosixPath(names[row["sample_data_token"]]).name] = (
                     join_inside(root, row["filename"])
                 )
-        except (KeyError, TypeError, AttributeError) as error:
-            raise DataError(
-                f"{table}: {error!r}",
-                "nuScenes' tables lidarseg.json and sample_data.json",
-            ) from error
     return files
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import name_errors, read_text
 from lidar_synth.files.parsing import parse_json
 
@@ -123,17 +123,12 @@ def _parse(path: Path) -> Any:
 
 def _numbers(values: Any, *keys: Any) -> list[float]:
     """The finite numbers under some keys of a JSON object or list."""
-    try:
+    with parsing(f"no numbers {keys[:4]}", "metres, unit quaternions, seconds, pixels"):
         found = [values[key] for key in keys]
         if not all(
             type(value) in (int, float) and abs(value) < 1e12 for value in found
         ):
             raise TypeError("something else than finite numbers")
-    except (KeyError, TypeError, IndexError) as error:
-        raise DataError(
-            f"no numbers {keys[:4]} ({error!r})",
-            "metres, unit quaternions, seconds, pixels",
-        ) from error
     return found
 
 

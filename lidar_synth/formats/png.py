@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.datasets.colours import COLOURS
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.errors import DataError, FileError, parsing
 from lidar_synth.files.disk import SKIP_HINT, list_files, write_file
 from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.description import check_provenance
@@ -104,7 +104,7 @@ class RangePNG(ScanFiles):
             f"{path}: its text",
             "a range image written by this package",
         )
-        try:
+        with parsing(path, "a range image written by this package"):
             sensor = Sensor.from_dict(facts["sensor"])
             scale = float(facts["scale"])
             if self._given is not None and sensor.shape != self._given.shape:
@@ -128,10 +128,6 @@ class RangePNG(ScanFiles):
             return range_image(
                 _steps(path, steps) * np.float32(scale), sensor, channels, str(path)
             ), facts
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise DataError(
-                f"{path}: {error}", "a range image written by this package"
-            ) from error
 
 
 def _stored_sensor(path: Path) -> Sensor | None:

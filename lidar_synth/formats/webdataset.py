@@ -33,7 +33,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError, LidarSynthError, shorten
+from lidar_synth.errors import ConfigError, DataError, LidarSynthError, parsing, shorten
 from lidar_synth.files.disk import (
     SKIP_HINT,
     list_files,
@@ -220,7 +220,7 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
         for name, content in contents.items()
         if name.endswith(".npy")
     }
-    try:
+    with parsing(where, "the members that this package writes", SKIP_HINT):
         boxes = None
         if "boxes" in arrays:
             values = arrays.pop("boxes")
@@ -242,10 +242,6 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
             for name in ("id", "domain", "pose")
             if name in facts
         }
-    except (LookupError, OverflowError, RecursionError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{where}: {error!r}", "the members that this package writes", SKIP_HINT
-        ) from error
     scan = decode_scan(arrays, where, sensor)
     scan.boxes = boxes
     scan.id = unquote(key)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, parsing
 from lidar_synth.files.claims import hold_claim, require_outside
 from lidar_synth.files.disk import (
     join_inside,
@@ -259,7 +259,7 @@ def check_facts(scan: Scan, where: str) -> None:
     Raises:
         DataError: on one.
     """
-    try:
+    with parsing(where, "what files can hold"):
         check_provenance(dict(scan.provenance or {}))
         if scan.pose is not None:
             check_pose(scan.pose)
@@ -267,8 +267,6 @@ def check_facts(scan: Scan, where: str) -> None:
             raise ValueError(
                 f"domain is {scan.domain}, not {REAL} (real) or {SYNTHETIC} (synthetic)"
             )
-    except ValueError as error:
-        raise DataError(f"{where}: {error}", "what files can hold") from error
 
 
 def project_scan(scan: Scan) -> RangeImage:
@@ -323,13 +321,10 @@ def read_notes(folder: Path) -> dict[int, dict[str, Any]]:
     for path in (
         list_files(folder / NOTES, ".json") if (folder / NOTES).is_dir() else []
     ):
-        try:
+        with parsing(
+            f"{path} is not a note of this package", hint=f"Remove {path.parent}."
+        ):
             notes[int(path.stem)] = parse_json(read_text(path), str(path))
-        except ValueError as error:
-            raise DataError(
-                f"{path} is not a note of this package ({error})",
-                hint=f"Remove {path.parent}.",
-            ) from error
     return notes
 
 

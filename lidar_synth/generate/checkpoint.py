@@ -39,7 +39,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, parsing
 from lidar_synth.files.disk import open_file, write_file
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned
 from lidar_synth.generate.devices import check_device
@@ -367,14 +367,12 @@ def _read(path: Path, tensors: bool = True) -> _Content:
         raise DataError(
             f"{path} has weights but no header of lidar_synth", f"a file of {FORMAT}"
         )
-    try:
+    with parsing(path):
         values = json.loads(text)
         digest = _verified(values)
         weights = values.pop("weights", None)
         return _Content(Header.from_dict(values), digest, weights, stored)
     # a ConfigError is a ValueError
-    except (ValueError, AttributeError, RecursionError) as error:
-        raise DataError(f"{path}: {error}") from error
 
 
 def _verified(values: dict[str, Any]) -> str:

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import parsing
 from lidar_synth.files.disk import read_text
 from lidar_synth.files.parsing import parse_json
 
@@ -58,17 +58,8 @@ def read_metadata(path: Path) -> dict[str, Any]:
         DataError: if it is not metadata of an Ouster sensor.
     """
     content = parse_json(read_text(path, EXPECTED, LONGEST), str(path), EXPECTED)
-    try:
+    with parsing(path, EXPECTED):
         return _arguments(content, path.stem)
-    except (
-        KeyError,
-        TypeError,
-        ValueError,
-        IndexError,
-        AttributeError,
-        OverflowError,
-    ) as error:
-        raise DataError(f"{path}: {type(error).__name__}: {error}", EXPECTED) from error
 
 
 def _arguments(content: dict[str, Any], name: str) -> dict[str, Any]:

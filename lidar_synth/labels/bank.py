@@ -29,7 +29,7 @@ from tqdm import tqdm
 from typing_extensions import Self
 
 from lidar_synth.datasets.classes import check_labels
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import hash_of_names, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.geometry import FARTHEST, Boxes, Scan, Sensor, Source, check_source
@@ -261,7 +261,7 @@ class ObjectBank:
             DataError: if it is not a bank of objects, or damaged.
         """
         path = Path(path)
-        try:
+        with parsing(path, f"a bank of objects ({FORMAT})"):
             size = path.stat().st_size if path.is_file() else 0
             least, factor = MOST_PACKED
             most = min(least + factor * size, MOST_BYTES)
@@ -274,10 +274,6 @@ class ObjectBank:
             boxes = {f.name: arrays.pop(f"box_{f.name}") for f in fields(Boxes)}
             boxes["names"] = tuple(boxes["names"].tolist())
             return cls(sensor=sensor, boxes=Boxes(**boxes), **arrays)
-        except (ValueError, TypeError, KeyError) as error:
-            raise DataError(
-                f"{path}: {error}", f"a bank of objects ({FORMAT})"
-            ) from error
 
     def save(self, path: str | Path) -> None:
         """Write the bank to a file; ``load`` is the inverse.

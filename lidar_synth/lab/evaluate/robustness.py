@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import NAMES, SEMANTIC_KITTI
-from lidar_synth.errors import ConfigError, DataError, choose
+from lidar_synth.errors import ConfigError, DataError, choose, parsing
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names, read_values
 from lidar_synth.files.parsing import read_facts
@@ -120,10 +120,8 @@ def read_means(path: Path) -> dict[str, float]:
     """
     expected = "a card that lidar-synth stress --json printed"
     facts = read_facts(path, expected)
-    try:
+    with parsing(path, expected):
         return Card(facts["clean"], facts["scores"], {}).means
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{path} ({error!r})", expected) from error
 
 
 def stress(

@@ -34,10 +34,10 @@ from lidar_synth.datasets.recordings import (
     all_frames,
     frames_of,
 )
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, parsing
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import read_yaml
-from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
+from lidar_synth.files.torch_files import load_pickle, state_of
 from lidar_synth.generate.checkpoint import (
     CODEC,
     ENCODER,
@@ -93,7 +93,7 @@ def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         for k, v in state_of(content, "state_dict", path).items()
         if not k.startswith("loss.")
     }
-    try:
+    with parsing(path, "LiDM's own config.yaml"):
         model = config["model"]["params"]
         data = config["data"]["params"]
         parts, conditioning = _parts(
@@ -109,13 +109,6 @@ def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             conditioning=conditioning,
         )
         return header, convert(weights, parts, str(path))
-    except DataError:
-        raise
-    except MISFITS as error:
-        raise DataError(
-            f"{path}: a configuration that does not fit ({error!r})",
-            "LiDM's own config.yaml",
-        ) from error
 
 
 def _config(path: Path) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from lidar_synth.errors import DataError
-from lidar_synth.files.torch_files import MISFITS, state_of
+from lidar_synth.errors import DataError, parsing
+from lidar_synth.files.torch_files import state_of
 from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.models import assemble
 from lidar_synth.generate.models.efficient_unet import LIMIT, PREDICTIONS
@@ -88,7 +88,7 @@ def read_r2dm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             keys do not fit.
     """
     content = load_fields(path, "R2DM", "ema_weights")
-    try:
+    with parsing(path, "R2DM's groups and keys"):
         cfg = content["cfg"]
         for (group, key), values in SUPPORTED.items():
             if cfg[group][key] not in values:
@@ -114,13 +114,6 @@ def read_r2dm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         )
         weights = state_of(content, "ema_weights", path)
         return header, {VELOCITY: convert_r2dm(weights, part, str(path))}
-    except DataError:
-        raise
-    except MISFITS as error:
-        raise DataError(
-            f"{path}: a configuration that does not fit ({error!r})",
-            "R2DM's groups and keys",
-        ) from error
 
 
 def _network(

@@ -20,9 +20,9 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, all_frames
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import sha256
-from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
+from lidar_synth.files.torch_files import load_pickle, state_of
 from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.models import assemble
@@ -76,7 +76,7 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
     """
     content = load_fields(path, "R2Flow", "weights")
     weights = state_of(content, "weights", path)
-    try:
+    with parsing(path, "R2Flow's groups and keys"):
         cfg = content["cfg"]
         data = cfg["data"]
         part = _network(data, cfg["model"], path)
@@ -98,13 +98,6 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             },
         )
         return header, {VELOCITY: convert(weights, part, str(path))}
-    except DataError:
-        raise
-    except MISFITS as error:
-        raise DataError(
-            f"{path}: a configuration that does not fit ({error!r})",
-            "R2Flow's groups and keys",
-        ) from error
 
 
 def load_fields(path: Path, peer: str, weights: str) -> dict[str, Any]:

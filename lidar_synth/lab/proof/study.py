@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from lidar_synth.bake.shard import torch_threads
 from lidar_synth.datasets.recordings import PLACES, TOWN, seen_by
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_sealed, seal
@@ -289,7 +289,7 @@ def read_outcome(path: Path) -> TrialOutcome:
         DataError: on a damaged file.
     """
     values = read_sealed(path, "the outcome of a training")
-    try:
+    with parsing(path, "the outcome of a training", "Remove it."):
         table = np.array(values["table"], np.int64)
         curve = [
             (int(step), np.array(part, np.int64)) for step, part in values["curve"]
@@ -297,10 +297,6 @@ def read_outcome(path: Path) -> TrialOutcome:
         return TrialOutcome(
             table, curve, [float(v) for v in values["losses"]], float(values["seconds"])
         )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(
-            f"{path} is damaged ({error!r})", "the outcome of a training", "Remove it."
-        ) from error
 
 
 def _is_there(path: Path, read: Callable[[Path], object]) -> bool:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import parsing
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.generate.flow.path import METRICS
@@ -49,15 +49,11 @@ def read_history(folder: Path) -> list[Measured]:
     if not path.is_file():
         return []
     values = parse_json(read_text(path), str(path))
-    try:
+    with parsing(path, "steps, losses and seconds", "Remove it."):
         return [
             Measured(int(step), float(loss), float(seconds))
             for step, loss, seconds in values
         ]
-    except (TypeError, ValueError) as error:
-        raise DataError(
-            f"{path} is damaged ({error})", "steps, losses and seconds", "Remove it."
-        ) from error
 
 
 class Watch:

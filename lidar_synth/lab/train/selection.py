@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, parsing
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.generate.checkpoint import Header
@@ -163,15 +163,11 @@ def load_costs(path: Path, settings: dict[str, Any]) -> TrajectoryCosts:
         FileError: where it cannot be read.
     """
     values = read_arrays(path)
-    try:
+    with parsing(path, "a selection of timesteps"):
         costs = TrajectoryCosts(values["total"], values["optima"])
         text = str(values["settings"])
         if str(values["checksum"]) != _checksum(text, asdict(costs)):
             raise ValueError("its checksum differs")
-    except (KeyError, ValueError, TypeError) as error:
-        raise DataError(
-            f"{path} is damaged ({error})", "a selection of timesteps"
-        ) from error
     made = parse_json(text, str(path))
     keys = (made | settings).keys() - HARMLESS
     other = sorted(k for k in keys if made.get(k) != settings.get(k))

@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, parsing
 from lidar_synth.files.disk import write_file
 from lidar_synth.generate.checkpoint import weights_hash
 from lidar_synth.generate.flow.path import METRICS
@@ -213,7 +213,9 @@ class Training:
             "average": {},
             "optimizer": {},
         }
-        try:
+        with parsing(
+            f"{path} is the state of another network", "the same configuration"
+        ):
             for name, tensor in tensors.items():
                 if tensor.is_floating_point() and not tensor.isfinite().all():
                     raise ValueError(f"{name} holds values that are not finite")
@@ -234,17 +236,6 @@ class Training:
                 )
                 _check_moments(optimizer)
                 _lay_out_moments(optimizer)
-        except (
-            RuntimeError,
-            ValueError,
-            LookupError,
-            TypeError,
-            AttributeError,
-        ) as error:
-            raise DataError(
-                f"{path} is the state of another network ({error})",
-                "the same configuration",
-            ) from error
         self.step, self.earlier = progress
         self.began = time.monotonic()
 

@@ -14,8 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lidar_synth.errors import ConfigError
-from lidar_synth.files.torch_files import MISFITS
+from lidar_synth.errors import MISFITS, ConfigError
 from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.lab.evaluate.extractors.archive import Archive, load_weights
 from lidar_synth.lab.evaluate.extractors.darknet import BLOCKS, RangeNet

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from lidar_synth.errors import ConfigError, DataError, suggest
+from lidar_synth.errors import ConfigError, DataError, parsing, suggest
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names, write_file
 from lidar_synth.files.parsing import read_sealed, seal
@@ -255,12 +255,8 @@ class DetectionWork:
         """
         path = self.path(arm, seed)
         values = read_sealed(path, "the outcome of a training")
-        try:
+        with parsing(path, "what was detected", "Remove it."):
             return {int(i): _found(one) for i, one in values["found"].items()}
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise DataError(
-                f"{path} is damaged ({error!r})", "what was detected", "Remove it."
-            ) from error
 
 
 def _found(values: Mapping[str, Any]) -> Found:
