@@ -270,7 +270,7 @@ def test_weights_that_do_not_fit_are_refused(
             | {"cond_stage_config": {"target": "x.FrozenCLIPTextEmbedder"}},
             "by FrozenCLIPTextEmbedder",
         ),
-        ({"linear_start": 1}, "KeyError.'first_stage_config'"),
+        ({"linear_start": 1}, "KeyError: 'first_stage_config'"),
     ],
 )
 def test_configurations_that_do_not_fit_are_refused(

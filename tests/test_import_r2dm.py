@@ -89,7 +89,7 @@ def test_an_imported_model_generates_scans(tmp_path: Path) -> None:
         ({"diffusion": {"timestep_type": "discrete"}}, "discrete"),
         ({"diffusion": {"noise_schedule": "linear"}}, "linear"),
         ({"data": {"depth_format": "x"}}, "depth_format"),
-        ({"data": {"dataset": "x"}}, "does not fit"),
+        ({"data": {"dataset": "x"}}, "R2DM.s groups and keys"),
         ({"model": {"base_channels": 2**40}}, "the arguments of its class"),
         ({"model": {"base_channels": 8}}, "other shapes"),
         ({"model": {"num_residual_blocks": (1, 1, 1, 1)}}, "unexpected keys"),

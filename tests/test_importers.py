@@ -259,7 +259,7 @@ def test_weights_that_do_not_fit_are_refused(
         (change(data={"data_format": "cartesian"}), "'cartesian'.*one of logscale"),
         (change(data={"dataset": "nuscenes"}), "'nuscenes'"),
         (change(data={"resolution": [64, 72]}), "resolution"),
-        ({"data": CFG["data"]}, "KeyError.'model'"),
+        ({"data": CFG["data"]}, "KeyError: 'model'"),
         (change(data={"min_depth": 90.0}), "range limits 90"),
     ],
     ids=[
