@@ -179,8 +179,11 @@ def test_scans_of_both_sets_are_skipped(
     shutil.copytree(folders[1], tmp_path / "fake")
     (tmp_path / "fake" / "000002.npz").write_bytes(b"PK")
     call = ["evaluate", str(folders[0]), str(tmp_path / "fake"), "--protocol", "town"]
-    result = CliRunner().invoke(app, [*call, "--on-bad", "skip", "--json"])
-    assert result.exception is None, result.exception
+    skipping = CliRunner().invoke(app, [*call, "--on-bad", "skip", "--json"])
+    assert skipping.exception is None, skipping.exception
+    (tmp_path / "fake" / "000002.npz").unlink()
+    without = CliRunner().invoke(app, [*call, "--json"])
+    assert json.loads(skipping.stdout) == json.loads(without.stdout)
 
 
 def test_a_measure_without_a_place_in_a_table_is_left_out_by_its_title(

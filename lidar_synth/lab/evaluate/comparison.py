@@ -1,19 +1,18 @@
 """Two sets of scans compared by a named protocol, and by the features of any extractor."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from tqdm import tqdm
-
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry import Scan, Source
+from lidar_synth.geometry import Source
 from lidar_synth.lab.evaluate.cache import extract_all
 from lidar_synth.lab.evaluate.features import Extractor, find_weights, load_published
 from lidar_synth.lab.evaluate.leakage import refuse_training_data
 from lidar_synth.lab.evaluate.loop_metric import Metric, Score, choice
 from lidar_synth.lab.evaluate.protocols import Protocol, find_protocol
+from lidar_synth.lab.evaluate.reading import readable
 
 
 def evaluate(
@@ -91,10 +90,8 @@ def evaluate(
         and len(real) > rules.limit
     ):
         indices = choice(len(real), rules.limit)
-    metric.update(_read(real, indices, "real", progress), real=True)
-    metric.update(
-        _read(generated, range(len(generated)), "generated", progress), real=False
-    )
+    metric.update(readable(real, indices, "real scans", progress), real=True)
+    metric.update(readable(generated, None, "generated scans", progress), real=False)
     scores = metric.scores()
     if left_out is not None:
         left_out |= metric.left_out
@@ -146,10 +143,3 @@ def _fill(
                     batch,
                     (generated,),
                 )
-
-
-def _read(
-    source: Source, indices: Sequence[int], name: str, progress: bool
-) -> Iterator[Scan]:
-    for i in tqdm(indices, desc=f"{name} scans", disable=not progress):
-        yield source[i]

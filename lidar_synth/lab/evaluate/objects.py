@@ -18,6 +18,7 @@ from lidar_synth.datasets.classes import LABELS
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Scan, Source
 from lidar_synth.geometry.arrays import Float64Array
+from lidar_synth.lab.evaluate.reading import readable
 from lidar_synth.labels.objects import Object, instances_of, objects_of
 
 CLASSES = {"car": LABELS["Car"], "person": LABELS["Pedestrian"]}
@@ -127,8 +128,7 @@ def crops(scans: Source, name: str, placed: bool = True) -> list[Crop]:
         placed: False for generated scans, which have no places.
     """
     found = []
-    for index in range(len(scans)):
-        scan = scans[index]
+    for scan in readable(scans):
         place = (scan.id.rpartition("/")[0] or ".") if placed else ""
         for one in _objects(scan):
             if _label(one) == CLASSES[name]:

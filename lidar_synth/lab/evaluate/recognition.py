@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Source
 from lidar_synth.lab.evaluate.distances import frechet_distance, squared_mmd
 from lidar_synth.lab.evaluate.isolated import count_isolated, share_of_isolated
+from lidar_synth.lab.evaluate.reading import readable
 from lidar_synth.lab.evaluate.segmentation import class_ious, mean_iou
 from lidar_synth.lab.evaluate.street_judge import StreetJudge
 
@@ -83,8 +83,7 @@ def recognise(
     table = np.zeros((len(NAMES), len(NAMES)), np.int64)
     isolated = np.zeros((2, len(NAMES) + 1), np.int64)
     features = []
-    for i in tqdm(range(len(scans)), desc=name, disable=not progress):
-        scan = scans[i]
+    for scan in readable(scans, None, name, progress):
         table += judge.confusion([scan])
         features.append(judge.features([scan]))
         isolated += count_isolated(scan)

@@ -26,6 +26,7 @@ from lidar_synth.formats.point_labels import decode_labels
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.geometry import Scan, Source, scan_hash
 from lidar_synth.lab.evaluate.labels import require_label
+from lidar_synth.lab.evaluate.reading import readable
 from lidar_synth.lab.evaluate.segmentation import load_judge, mean_iou, tabulate
 from lidar_synth.lab.evaluate.street_judge import load_archive
 from lidar_synth.noise import keyed_rng
@@ -205,8 +206,7 @@ def corrupt(scans: Source, case: str, seed: int = 0) -> Iterator[Scan]:
     """
     name, _, severity = case.partition("/")
     change = CORRUPTIONS[name].at(severity) if severity else None
-    for number in range(len(scans)):
-        scan = scans[number]
+    for number, scan in enumerate(readable(scans)):
         require_label(scan)
         yield scan if change is None else change(scan, keyed_rng(seed, number))
 

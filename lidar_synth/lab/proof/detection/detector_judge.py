@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.torch_files import load_pickle
 from lidar_synth.geometry import Scan, Source
 from lidar_synth.lab.evaluate.extractors.archive import load_weights
+from lidar_synth.lab.evaluate.reading import readable
 from lidar_synth.lab.proof.detection.bev import Found
 from lidar_synth.lab.proof.detection.boxes import (
     CLASSES,
@@ -90,8 +90,7 @@ def recognise_boxes(
         DataError: on scans without boxes.
     """
     pairs: list[tuple[Found, Truth]] = []
-    for i in tqdm(range(len(scans)), desc=name, disable=not progress):
-        scan = scans[i]
+    for scan in readable(scans, None, name, progress):
         truth = _truth(network, scan)
         pairs.append((network.find(scan), truth))
     classes: dict[str, dict[str, dict[str, float]]] = {}
