@@ -48,6 +48,7 @@ from lidar_synth.bank.index import SETTINGS
 from lidar_synth.cli import app
 from lidar_synth.cli.bake import _resources
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
+from lidar_synth.files import processes
 from lidar_synth.files.disk import sha256
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import (
@@ -367,13 +368,24 @@ def test_a_bake_that_fails_before_its_first_shard_leaves_no_claim(
     assert (plan.out / SETTINGS).is_file()  # another process needs it
 
 
-@pytest.mark.parametrize(("allowed", "workers"), [({3}, 1), ({0, 2, 5}, 3)])
+@pytest.mark.parametrize(
+    ("allowed", "quota", "workers"),
+    [
+        ({3}, "max 100000", 1),
+        ({0, 2, 5}, "400000 100000", 3),
+        ({0, 2, 5}, "150000 100000", 2),
+    ],
+)
 def test_there_is_one_worker_for_each_core_that_may_be_used(
     plan: BakePlan,
     allowed: set[int],
+    quota: str,
     workers: int,
     monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
+    (tmp_path / "cpu.max").write_text(quota)
+    monkeypatch.setattr(processes, "QUOTA", tmp_path / "cpu.max")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: allowed, raising=False)
     assert _resources(plan, None, None, None).workers == workers
 

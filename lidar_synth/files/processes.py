@@ -7,8 +7,10 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from math import ceil
 from multiprocessing import get_context, resource_tracker
+from pathlib import Path
 from typing import Any, TypeVar
 
 from lidar_synth.errors import ProcessError
@@ -18,6 +20,9 @@ Result = TypeVar("Result")
 
 GUARD = "In a script, put what starts processes below: if __name__ == '__main__':"
 """What to type where a process ended before its work: it runs a script again from the top."""
+
+QUOTA = Path("/sys/fs/cgroup/cpu.max")
+"""What a container may use of the CPUs: microseconds in each period of as many microseconds."""
 
 _work: Callable[[Any], Any] | None = None
 _busy = _stopped = False
@@ -57,10 +62,14 @@ def _next(item: Any) -> Any:
 
 def usable_cores() -> int:
     """Number of CPU cores that this process may use: a batch system or container may allow it
-    fewer than the machine has."""
+    fewer than the machine has, or a part of their time."""
+    cores = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):  # not on Windows and macOS
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        cores = len(os.sched_getaffinity(0))
+    with suppress(OSError, ValueError):  # no such file; "max"
+        quota, period = map(int, QUOTA.read_text().split())
+        cores = min(cores, ceil(quota / period))
+    return cores
 
 
 @contextmanager
