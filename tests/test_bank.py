@@ -368,6 +368,11 @@ def test_missing_libraries_are_reported(
         match=r"hdf5plugin cannot be imported .*pip install 'lidar_synth\[blosc2\]'",
     ):
         ShardWriter(root / "new.h5", facts, Entry("new.h5", 0, 0, 1))
+    # whose copy of a file in memory has a wrong checksum
+    monkeypatch.setattr(h5py.version, "hdf5_version_tuple", (1, 14, 6))
+    with pytest.raises(LibraryError, match=r"HDF5 2\.0.*pip install"):
+        ShardWriter(root / "old.h5", some_facts(), Entry("old.h5", 0, 0, 1))
+    assert not (root / "old.h5").exists()
 
 
 def test_blosc2_banks_are_read(tmp_path: Path) -> None:

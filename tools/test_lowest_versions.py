@@ -4,9 +4,9 @@ declares.
     python tools/test_lowest_versions.py [--venv FOLDER] [TESTS...]
 
 The script makes its own virtual environment and installs exactly those versions in it. Everything
-else (torch, open3d and the libraries that only the tests need) comes from the environment that runs
-the script: their lowest versions need gigabytes of CUDA libraries, or have no build for CPUs. The
-table at the end lists the versions that were used.
+else (torch and the libraries that only the tests need) comes from the environment that runs the
+script: the lowest version of torch needs gigabytes of CUDA libraries. The table at the end lists
+the versions that were used.
 """
 
 import os
@@ -23,7 +23,7 @@ import tomllib
 from typer import Argument, run
 
 ROOT = Path(__file__).parent.parent
-KEPT = ("torch", "open3d")
+KEPT = ("torch",)
 """Dependencies whose version stays that of the environment that runs this."""
 
 TESTS = (
@@ -80,7 +80,10 @@ def install(folder: Path, wanted: dict[str, str]) -> Path:
     subprocess.run([*pip, *pins], check=True)
     packages = next((folder / "lib").glob("python*")) / "site-packages"
     here = [path for path in sys.path if path.endswith("-packages")]
-    (packages / "rest.pth").write_text("\n".join([str(ROOT), *here]) + "\n")
+    # as site folders: the checkout is installed there by a .pth file
+    (packages / "rest.pth").write_text(
+        f"import site; list(map(site.addsitedir, {here!r}))\n"
+    )
     return python
 
 

@@ -39,7 +39,7 @@ class ShardWriter:
 
     Raises:
         FileError: if the file cannot be written or the disk is full; also by the methods.
-        LibraryError: on Blosc2 without hdf5plugin.
+        LibraryError: on Blosc2 without hdf5plugin, or h5py with HDF5 before 2.0.
     """
 
     def __init__(
@@ -63,8 +63,8 @@ class ShardWriter:
         self._pool = ThreadPoolExecutor(threads, "compress")
         self._limit = _PENDING * threads
         with _on_disk(path):
-            self._out = path.open("wb")
             self._file = _create(path.name, facts, entry.scans)
+            self._out = path.open("wb")
             try:
                 self._declare(facts)
             except BaseException:
@@ -219,6 +219,12 @@ class ShardWriter:
 
 
 def _create(name: str, facts: Facts, scans: int) -> h5py.File:
+    if h5py.version.hdf5_version_tuple < (2,):  # get_file_image has a wrong checksum
+        raise LibraryError(
+            f"h5py with HDF5 {h5py.version.hdf5_version}",
+            "HDF5 2.0 or later, to write a bank",
+            "pip install --upgrade h5py",
+        )
     # One block, so that a remote reader gets all metadata with one request.
     options: dict[str, Any] = {"meta_block_size": metadata_size(facts, scans)}
     if facts.layout == "paged":
