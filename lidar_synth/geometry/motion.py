@@ -51,10 +51,9 @@ def interpolate_poses(
             f"{len(times)} times for {len(poses)} poses",
             "two or more poses with increasing times",
         )
-    if (
-        len(at)
-        and not times[0] - FARTHEST <= at.min() <= at.max() <= times[-1] + FARTHEST
-    ):
+    if not len(at):
+        return np.empty((0, 4, 4))
+    if not times[0] - FARTHEST <= at.min() <= at.max() <= times[-1] + FARTHEST:
         raise DataError(
             f"times from {at.min() - times[0]:g} s to {at.max() - times[0]:g} s after the first "
             "pose",
@@ -64,11 +63,17 @@ def interpolate_poses(
     start = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
     fraction = (at - times[start]) / np.diff(times)[start]
     steps = poses[:-1, :3, :3].swapaxes(-1, -2) @ poses[1:, :3, :3]
-    axes, angles = _axes_and_angles(steps)
+    from scipy.spatial.transform import Rotation  # takes long to import
+
+    turns = Rotation.from_matrix(steps).as_rotvec()
+    if (np.linalg.norm(turns, axis=1) > 3).any():
+        raise DataError(
+            "poses that turn by half a circle from one to the next",
+            "poses at least ten times a second",
+        )
+    turned = Rotation.from_rotvec(fraction[:, None] * turns[start])
     result = np.tile(np.eye(4), (len(at), 1, 1))
-    result[:, :3, :3] = poses[start, :3, :3] @ _rotations(
-        axes[start], fraction * angles[start]
-    )
+    result[:, :3, :3] = poses[start, :3, :3] @ turned.as_matrix()
     result[:, :3, 3] = (
         poses[start, :3, 3]
         + fraction[:, None] * np.diff(poses[:, :3, 3], axis=0)[start]
@@ -90,36 +95,3 @@ def from_world(points: Float64Array, poses: Float64Array) -> Float64Array:
     return np.asarray(
         np.einsum("...ji,...j->...i", poses[..., :3, :3], moved), np.float64
     )
-
-
-def _axes_and_angles(
-    rotations: Float64Array,
-) -> tuple[Float64Array, Float64Array]:
-    """(P, 3) unit axes and (P,) angles in [0, pi], radians, of (P, 3, 3) rotations between
-    poses."""
-    twice_sine = np.stack(
-        [
-            rotations[:, 2, 1] - rotations[:, 1, 2],
-            rotations[:, 0, 2] - rotations[:, 2, 0],
-            rotations[:, 1, 0] - rotations[:, 0, 1],
-        ],
-        -1,
-    )
-    length = np.linalg.norm(twice_sine, axis=1)
-    angles = np.arctan2(length, np.trace(rotations, axis1=1, axis2=2) - 1)
-    if (angles > 3).any():
-        raise DataError(
-            "poses that turn by half a circle from one to the next",
-            "poses at least ten times a second",
-        )
-    return twice_sine / np.maximum(length, 1e-300)[:, None], angles
-
-
-def _rotations(axes: Float64Array, angles: Float64Array) -> Float64Array:
-    """(N, 3, 3) rotations about unit axes by angles, by Rodrigues' formula."""
-    cross = np.zeros((len(axes), 3, 3))
-    cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0] = axes.T
-    cross -= cross.swapaxes(-1, -2)
-    sine = np.sin(angles)[:, None, None]
-    versine = (1 - np.cos(angles))[:, None, None]
-    return np.eye(3) + sine * cross + versine * (cross @ cross)
