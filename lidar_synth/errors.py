@@ -56,19 +56,18 @@ def shorten(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[:most]} ..."
 
 
-def suggest(name: object, known: Iterable[str], most: int = 3) -> str:
+def suggest(name: object, known: Iterable[str]) -> str:
     """A hint for a misspelt name: "Did you mean 'kitti'?", or "" if no known name is near.
 
     Args:
         name: what was given.
         known: the names that exist.
-        most: number of names in the hint.
 
     Example:
         >>> suggest("kiti", ["kitti", "pcd"])
         "Did you mean 'kitti'?"
     """
-    near = get_close_matches(str(name), list(known), most)
+    near = get_close_matches(str(name), list(known))
     return f"Did you mean {' or '.join(map(repr, near))}?" if near else ""
 
 
