@@ -28,22 +28,9 @@ from lidar_synth.labels.own import IgnoreLabels, RemoveLabels
 from lidar_synth.labels.policies import read_policy
 from lidar_synth.mixing import MixedScans, MixingPlan
 from lidar_synth.mixing.schedules import constant_from
-from lidar_synth.mixing.settings import (
-    OPTIONS,
-    VARIABLE,
-    mix_for_trainer,
-    open_synthetic,
-    read_settings,
-)
+from lidar_synth.mixing.settings import mix_for_trainer, read_settings
 
-__all__ = [
-    "OPTIONS",
-    "VARIABLE",
-    "EpochLoader",
-    "mix_for_trainer",
-    "open_synthetic",
-    "read_settings",
-]
+__all__ = ["EpochLoader", "mix_for_trainer", "read_settings"]
 
 
 def take_classes(settings: dict[str, Any]) -> Taxonomy:

@@ -54,8 +54,8 @@ def write_infos(
     Args:
         out: output folder.
         real: the trainer's own list (``.pkl`` or ``.json``), as written by its ``create_data.py``.
-        settings: settings of the mixture, see ``mixture.OPTIONS``. With a schedule, or another
-            ``epoch_size`` than ``"add"``, the list has as many slots as the epoch with most
+        settings: settings of the mixture, see ``mixing.settings.OPTIONS``. With a schedule, or
+            another ``epoch_size`` than ``"add"``, the list has as many slots as the epoch with most
             synthetic samples, and ``SynthSampler`` takes an epoch's entries from it.
         data_root: the folder to which the paths in ``real`` are relative.
         points: the folder of the points under ``data_root`` (the configuration's

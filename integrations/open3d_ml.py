@@ -58,7 +58,7 @@ def dataset_class() -> Any:
 
         Args:
             dataset_path: as there.
-            mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them.
+            mixture: settings (``lidar_synth.mixing.settings.OPTIONS``) or a YAML file of them.
             options: as there.
 
         Raises:

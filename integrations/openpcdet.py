@@ -5,8 +5,9 @@
     LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.openpcdet train.py \\
         --cfg_file cfgs/kitti_models/pointpillar.yaml --set DATA_CONFIG.DATASET MixedKitti
 
-The settings (``mixture.OPTIONS``) may also be in the data configuration, under ``LIDAR_SYNTH``; its
-reader takes no ratio by epoch, {epoch: ratio}, because keys must be names there.
+The settings (``mixing.settings.OPTIONS``) may also be in the data configuration, under
+``LIDAR_SYNTH``; its reader takes no ratio by epoch, {epoch: ratio}, because keys must be names
+there.
 OpenPCDet's files stay unchanged, and its own code processes real samples.
 """
 

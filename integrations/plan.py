@@ -42,8 +42,8 @@ def write_plan(
     """Write the order of a mixture's first epochs.
 
     Args:
-        settings: of the mixture, see ``lidar_synth.integrations.mixture``; its synthetic source is
-            a bank.
+        settings: of the mixture, see ``lidar_synth.mixing.settings``; its synthetic source is a
+            bank.
         out: the file to write, ``.npz``.
         real: number of the trainer's real samples.
         epochs: number of epochs.

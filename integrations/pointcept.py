@@ -65,7 +65,7 @@ class MixedSemanticKITTI(MixedEpoch, SemanticKITTIDataset):  # type: ignore[misc
     """``SemanticKITTIDataset`` with synthetic samples, for training.
 
     Args:
-        mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them.
+        mixture: settings (``lidar_synth.mixing.settings.OPTIONS``) or a YAML file of them.
             ``labels: none`` is refused if the transforms collect ``segment``.
         options: as for ``SemanticKITTIDataset``. ``cache`` is refused, because it identifies
             samples by name only.

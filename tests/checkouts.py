@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from lidar_synth.integrations.mixture import VARIABLE
+
+from lidar_synth.mixing.settings import VARIABLE
 
 
 def checkout(variable: str, what: str) -> Path:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from lidar_synth.integrations.mixture import VARIABLE
+from lidar_synth.mixing.settings import VARIABLE
 
 
 def launched(

@@ -8,7 +8,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import yaml
-from lidar_synth.integrations.mixture import OPTIONS
 from project import ROOT
 
 from lidar_synth.bake import BakeJob
@@ -16,6 +15,7 @@ from lidar_synth.errors import LibraryError
 from lidar_synth.geometry.layout.files import load_layout
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.train import DistillConfig, TrainConfig, load_config
+from lidar_synth.mixing.settings import OPTIONS
 
 
 def check_python(code: str) -> None:

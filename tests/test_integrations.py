@@ -19,12 +19,10 @@ from banks import some_image, write_bank
 from lidar_synth.integrations.detection import require_boxes
 from lidar_synth.integrations.folders import MANIFEST, export_mixture, write_planes
 from lidar_synth.integrations.mixture import (
-    VARIABLE,
     EpochLoader,
     class_ids,
     id_table,
     mix_for_trainer,
-    open_synthetic,
     points_of,
     read_settings,
     refuse_unlabelled,
@@ -49,6 +47,7 @@ from lidar_synth.formats.calibration import in_view
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.labels.own import IgnoreLabels, RemoveLabels
 from lidar_synth.mixing import MixedScans
+from lidar_synth.mixing.settings import VARIABLE, open_synthetic
 
 
 def test_synthetic_scans_by_name(tmp_path: Path) -> None:

@@ -27,10 +27,11 @@ provide("numpy.int")  # as the launcher does
 from dataloader.dataset_semantickitti import collate_fn_BEV, get_model_class
 from dataloader.pc_dataset import get_pc_model_class
 from lidar_synth.integrations.cylinder3d import NAME, register
-from lidar_synth.integrations.mixture import VARIABLE, EpochLoader
+from lidar_synth.integrations.mixture import EpochLoader
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import open_scans
+from lidar_synth.mixing.settings import VARIABLE
 
 REAL = 6
 EXTRA = 4

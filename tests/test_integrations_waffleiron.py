@@ -12,13 +12,13 @@ import pytest
 import yaml
 from checkouts import checkout
 from launched import clone, epochs, launched
-from lidar_synth.integrations.mixture import VARIABLE
 from lidar_synth.integrations.waffleiron import NAME, register
 from streets import semantic_kitti, synthetic
 from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import open_scans
+from lidar_synth.mixing.settings import VARIABLE
 
 ROOT = checkout("WAFFLEIRON_ROOT", "WaffleIron")
 sys.path.insert(0, str(ROOT))
