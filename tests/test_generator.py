@@ -322,7 +322,7 @@ def test_models_are_found_by_shipped_name_or_by_path(
     ):
         load_generator("town")
     (tmp_path / "weights" / "town.safetensors").write_bytes(path.read_bytes())
-    assert load_generator("town").scans(0, [1])[0].id == "town/0/1"
+    assert load_generator("town").scans(0, [True])[0].id == "town/0/1"
     with pytest.raises(
         ConfigError,
         match=r"model 'city'; expected a shipped one \(town\), a .safetensors file or hf:",

@@ -301,7 +301,7 @@ def test_numbers_may_be_numpys() -> None:
 
 def test_several_sources() -> None:
     real = Sources(Scans("a", 4), Scans("b", 8))
-    assert [len(real), real[0].id, real[4].id, real[11].id] == [12, "a0", "b0", "b7"]
+    assert [len(real), real[0].id, real[4].id, real[-1].id] == [12, "a0", "b0", "b7"]
     synth = Sources(Endless(name="x"), Scans("held", 3), weights=[2, 1])
     train = MixedScans(real, synth, 0.5, epoch_size=24)
     names = ids(train)

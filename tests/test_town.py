@@ -53,20 +53,18 @@ def as_bytes(scan: Scan) -> list[bytes]:
     assert (
         scan.raw_label is not None and scan.boxes is not None and scan.pose is not None
     )
-    boxes = [
-        scan.boxes.values,
-        scan.boxes.occlusion,
-        scan.boxes.truncation,
-        scan.boxes.image_box,
-        scan.boxes.instance,
-    ]
+    boxes = scan.boxes
     arrays = [
         scan.points,
         scan.reflectance,
         scan.raw_label,
         scan.ring,
         scan.pose,
-        *boxes,
+        boxes.values,
+        boxes.occlusion,
+        boxes.truncation,
+        boxes.image_box,
+        boxes.instance,
     ]
     return [np.ascontiguousarray(a).tobytes() for a in arrays]
 
@@ -95,9 +93,11 @@ def test_different_seeds_and_indices_give_different_scans(
 def test_a_town_is_an_indexable_source() -> None:
     town = Town(scans=3)
     assert len(town) == 3
-    for index in (-1, 3):
-        with pytest.raises(IndexError, match="of a town of 3"):
-            town[index]
+    with pytest.raises(IndexError, match="scan 3 of 3"):
+        town[3]
+    with pytest.raises(TypeError, match="scan 1.5; expected a whole number"):
+        town[1.5]  # type: ignore[index]
+    assert town[-1].id == "town-0-000002"
 
 
 @pytest.mark.parametrize(

@@ -297,7 +297,7 @@ class Generator:
         return [
             replace(
                 unproject(image),
-                id=f"{self.name}/{seed}/{index}",
+                id=f"{self.name}/{seed}/{index:d}",
                 domain=SYNTHETIC,
                 provenance=provenance,
             )

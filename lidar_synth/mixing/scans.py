@@ -18,6 +18,7 @@ from lidar_synth.geometry import (
     Sensor,
     check_source,
     identity_of,
+    index_of,
 )
 from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
@@ -417,11 +418,7 @@ class MixedScans(Dataset[Any]):
         return self.mixture.length
 
     def __getitem__(self, index: int) -> Any:
-        epoch = self.epoch_of(index)
-        length = len(self)
-        if not -length <= index < length:
-            raise IndexError(f"sample {index} of {length}")
-        return self.sample(epoch, int(index) % length)
+        return self.sample(self.epoch_of(index), index_of(index, len(self)))
 
     def domain(self, index: int) -> int:
         """The domain of the sample at ``index`` in the current epoch: 0 = real, 1 = synthetic.
@@ -452,7 +449,7 @@ class MixedScans(Dataset[Any]):
     def _planned_at(self, index: int) -> tuple[MixingPlan, int]:
         """The plan and the position in it of an index, which may count from the end."""
         plan = self.plan(index.epoch if isinstance(index, Position) else None)
-        return plan, range(len(plan))[index]
+        return plan, index_of(index, len(plan))
 
     def _weight_of(self, plan: MixingPlan, position: int) -> float:
         source = plan[position][0]

@@ -9,7 +9,7 @@ from torch.utils.data import ConcatDataset
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry import Scan, Sensor, check_source
+from lidar_synth.geometry import Scan, Sensor, check_source, index_of
 from lidar_synth.labels.own import check_share
 
 
@@ -65,9 +65,7 @@ class Sources:
 
     def __getitem__(self, index: int) -> Any:
         """The scan at ``index`` of the concatenated sources."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"scan {index} of {len(self)}")
-        return ConcatDataset(self.sources)[index]
+        return ConcatDataset(self.sources)[index_of(index, len(self))]
 
 
 def each(source: Any) -> tuple[tuple[Any, float | None], ...]:

@@ -16,7 +16,7 @@ from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import json_checksum
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.geometry import SYNTHETIC, Scan, Sensor, load_sensor
+from lidar_synth.geometry import SYNTHETIC, Scan, Sensor, index_of, load_sensor
 from lidar_synth.geometry.arrays import Float32Array, Int32Array
 from lidar_synth.lab.town.boxes import boxes_of
 from lidar_synth.lab.town.camera import CAMERA
@@ -214,26 +214,23 @@ class Town:
         ``index``.
 
         Raises:
-            IndexError: on an index outside 0 to ``len - 1``.
+            TypeError, IndexError: as ``index_of``.
         """
-        snapshot, pose, _ = self.moment(self._check(index))
+        index = index_of(index, len(self))
+        snapshot, pose, _ = self.moment(index)
         stretch, frame = divmod(index, STRETCH_FRAMES)
         light = sample_light(rng_for(LIGHT, self.seed, stretch))
         rng = rng_for(IMAGE, self.seed, stretch, frame)
         return render(snapshot, pose, self.world(index).surfaces, light, rng)
 
-    def _check(self, index: int) -> int:
-        if not 0 <= index < len(self):
-            raise IndexError(f"scan {index} of a town of {len(self)} scans")
-        return index
-
     def __getitem__(self, index: int) -> Scan:
-        """Scan number ``index``.
+        """Scan number ``index``, which may count from the end.
 
         Raises:
-            IndexError: on an index outside 0 to ``len - 1``.
+            TypeError, IndexError: as ``index_of``.
         """
-        snapshot, pose, rng = self.moment(self._check(index))
+        index = index_of(index, len(self))
+        snapshot, pose, rng = self.moment(index)
         world = self.world(index)
         travelled = self._travelled(index)
         rays, surface, points, reflectance = self._turn(
