@@ -22,11 +22,12 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA, KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.formats.writer import Writer
-from lidar_synth.geometry import Scan, Source, scan_hash
+from lidar_synth.geometry import Scan, Source, identity_of, scan_hash
 from lidar_synth.mixing import MixedScans
 
 COMPARED = 3
-"""Number of synthetic samples by which a resumed export is compared with the one it continues."""
+"""Number of real, synthetic and validation scans by which a resumed export is compared with the one
+it continues."""
 MANIFEST = "mixture.csv"
 SETTINGS = ".mixture.json"
 
@@ -71,16 +72,19 @@ def export_mixture(
     count = len(mixed)
     camera = calibration or OBJECT_CAMERA
     held_out = [] if validation is None else validation
+    compared = [held_out[number] for number in range(min(COMPARED, len(held_out)))]
     claim(
         root / SETTINGS,
         {
             "plan": mixed.plan(epoch).hash,
-            "samples": _first_synthetic(mixed, epoch),
+            "samples": _first_samples(mixed, epoch),
             "layout": layout,
             "projection": camera.projection.tolist(),
             "camera_from_sensor": camera.camera_from_sensor.tolist(),
             "image": camera.image_size,
-            **({} if validation is None else {"validation": len(held_out)}),
+            "validation": None
+            if validation is None
+            else [identity_of(validation), *map(scan_hash, compared)],
         },
     )
     kitti = layout == "kitti"
@@ -141,11 +145,12 @@ def _sample(mixed: MixedScans, epoch: int, position: int) -> Scan:
     return scan
 
 
-def _first_synthetic(mixed: MixedScans, epoch: int) -> list[str]:
-    """Hashes of the first synthetic samples, which depend on the label policy and the augmentation;
-    the plan does not."""
-    first = np.flatnonzero(mixed.plan(epoch).domain)[:COMPARED].tolist()
-    return [scan_hash(_sample(mixed, epoch, position)) for position in first]
+def _first_samples(mixed: MixedScans, epoch: int) -> list[str]:
+    """Hashes of the first samples of each domain, which depend on the label policy and the
+    augmentation; the plan does not."""
+    synthetic = mixed.plan(epoch).domain
+    first = [np.flatnonzero(kind)[:COMPARED] for kind in (~synthetic, synthetic)]
+    return [scan_hash(_sample(mixed, epoch, int(n))) for n in np.concatenate(first)]
 
 
 def write_planes(root: str | Path, split: str = "trainval") -> int:

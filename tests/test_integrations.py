@@ -266,16 +266,18 @@ def test_a_mixture_as_semantic_kitti(mixed: MixedScans, tmp_path: Path) -> None:
         export_mixture(
             mixed, tmp_path / "out", "semantic_kitti", epoch=1, progress=False
         )
-    other = MixedScans(
-        mixed.real[0],
-        mixed.synthetic[0],
-        ratio=0.4,
-        seed=2,
-        to_sample=as_is,
-        labels="none",
-    )
-    with pytest.raises(ConfigError, match="was filled with"):
-        export_mixture(other, tmp_path / "out", "semantic_kitti", progress=False)
+    thin_real = {"augment": lambda scan, rng: scan if scan.domain else scan[::2]}
+    for options in ({"labels": "none"}, thin_real | {"augment_real": True}):
+        other = MixedScans(
+            mixed.real[0],
+            mixed.synthetic[0],
+            ratio=0.4,
+            seed=2,
+            to_sample=as_is,
+            **options,
+        )
+        with pytest.raises(ConfigError, match="was filled with"):
+            export_mixture(other, tmp_path / "out", "semantic_kitti", progress=False)
 
 
 def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:
@@ -314,16 +316,18 @@ def test_an_export_has_validation_apart_from_training(
     options = {"calibration": CAMERA, "validation": held, "progress": False}
     assert export_mixture(mixed, tmp_path / "out", layout, **options) == 7
     assert export_mixture(mixed, tmp_path / "out", layout, **options) == 0
+    with pytest.raises(ConfigError, match="was filled with .*validation"):
+        others = {"validation": [street(i) for i in (8, 9)]}
+        export_mixture(mixed, tmp_path / "out", layout, **options | others)
     train, val = (
         open_scans(tmp_path / "out", split=split) for split in ("train", "val")
     )
     assert len(train) == 5 and len(val) == 2
-    wanted = [
-        scan if layout == "semantic_kitti" else in_view(scan, CAMERA) for scan in held
-    ]
-    for scan, own in zip(val, wanted, strict=True):
-        assert layout == "kitti" or np.array_equal(scan.points, own.points)
-        assert scan.boxes is None or len(scan.boxes) == len(own.boxes or ())
+    for scan, own in zip(val, held, strict=True):
+        if layout == "kitti":
+            scan, own = in_view(scan, CAMERA), in_view(own, CAMERA)
+            assert scan.boxes and own.boxes and len(scan.boxes) == len(own.boxes)
+        assert np.array_equal(scan.points, own.points)
 
 
 def test_scans_without_labels_are_not_exported(tmp_path: Path) -> None:
