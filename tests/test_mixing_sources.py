@@ -340,6 +340,11 @@ def batch_of(sample: Any) -> Any:
             r"of the type dict.*MixedScans.wrap",
         ),
         (
+            lambda: mix([Scans("r", 2), Scans("t", 2)], Endless()),
+            ConfigError,
+            r"of the type Scans; expected scans. Sources\(a, b\) joins several",
+        ),
+        (
             lambda: MixedScans(Scans("r", 2), "town"),
             ConfigError,
             r"str as a source of scans.*load_generator",

@@ -97,7 +97,8 @@ def first_of(source: Any) -> Scan:
         raise ConfigError(
             f"samples of the type {type(first).__name__}",
             "scans",
-            "MixedScans.wrap(dataset, synth, to_sample=...) takes a trainer's own dataset.",
+            "Sources(a, b) joins several sources; MixedScans.wrap(dataset, synth, to_sample=...) "
+            "takes a trainer's own dataset.",
         )
     return first
 
