@@ -40,6 +40,14 @@ WRONG: dict[str, tuple[str, str]] = {
         "as_sensor: 64",
         "sensor 64; expected a preset's name, a file",
     ),
+    "a sensor to be found": (
+        "as_sensor: auto",
+        "as_sensor: auto for a trainer.*; expected the sensor of your scans",
+    ),
+    "a locality": (
+        "locality: shards",
+        "locality='shards'; expected \"shard\", or None",
+    ),
     "a typing error": ("seed: [0", "is not YAML"),
     "a tag": ("seed: !!python/name:os.system", "it has the tag"),
     "settings as a list": ("[1, 2]", "expected a dict of synthetic, epochs, ratio"),
@@ -70,6 +78,17 @@ def test_a_yaml_bomb_is_refused_at_once(tmp_path: Path) -> None:
     path.write_text("synthetic: " + "x" * 300_000)
     with pytest.raises(DataError, match="mix.yaml"):
         read_settings(path)
+
+
+def test_a_bank_is_streamed_and_balanced_by_settings(tmp_path: Path) -> None:
+    write_bank(tmp_path, [some_image(i) for i in range(4)], shard_size=2)
+    settings = {"synthetic": str(tmp_path), "ratio": 0.5}
+    plain, balanced, streamed = (
+        mix_for_trainer(4, settings | more, as_is).mixture
+        for more in ({}, {"balanced": True}, {"locality": "shard"})
+    )
+    assert [m.balanced for m in (plain, balanced, streamed)] == [False, True, True]
+    assert [m.synthetic[0].block for m in (balanced, streamed)] == [1, 2]
 
 
 @pytest.mark.parametrize("synthetic", [{"threshold": 1}, "a" * 5000])

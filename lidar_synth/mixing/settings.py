@@ -40,6 +40,8 @@ OPTIONS = (
     "seed",
     "reuse",
     "epoch_size",
+    "balanced",
+    "locality",
     "unboxed",
     "as_sensor",
     "classes",
@@ -248,6 +250,12 @@ def mix_for_trainer(
             f"loss_weight: {settings['loss_weight']} for a trainer that adds up a batch's losses",
             "no key loss_weight",
             "Use a smaller ratio, or one that falls: ratio: {synthetic_first: EPOCHS}.",
+        )
+    if settings.get("as_sensor") == "auto":
+        raise ConfigError(
+            "as_sensor: auto for a trainer, which reads real scans itself",
+            "the sensor of your scans",
+            "Name it: as_sensor: hdl64e_kitti, for instance, or a YAML file.",
         )
     if settings.get("synthetic") is None:
         raise ConfigError(
