@@ -20,12 +20,13 @@ import numpy as np
 from lidar_synth.integrations.mixture import mix_for_trainer, read_settings
 from lidar_synth.integrations.reader import PLAN_FORMAT
 
-from lidar_synth.bank import is_bank
+from lidar_synth.bank import Bank
 from lidar_synth.errors import ConfigError, LidarSynthError
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.labels.own import KeepBoxes, KeepCondition, KeepLabels, RemoveLabels
 from lidar_synth.labels.policies import read_policy
 from lidar_synth.mixing.plan import VERSION
+from lidar_synth.mixing.settings import open_synthetic
 
 POLICIES = {
     KeepLabels: "generated",
@@ -79,13 +80,14 @@ def write_plan(
             f"{real} real samples and {epochs} epochs in {out}",
             "at least one of each, in a .npz file",
         )
-    if not is_bank(settings.get("synthetic", "")):
+    bank = open_synthetic(settings.get("synthetic"))
+    if not isinstance(bank, Bank):
         raise ConfigError(
             f"synthetic: {settings.get('synthetic')}",
             "a bank",
             "lidar-synth bake OUT writes one.",
         )
-    mixed = mix_for_trainer(real, settings)
+    mixed = mix_for_trainer(real, {**settings, "synthetic": bank})
     if (
         "boxes" in mixed.synthetic[0].fields
         and labels != "none"

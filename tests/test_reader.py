@@ -432,6 +432,7 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
             {"synthetic": "town"},
             "synthetic: town; expected a bank. lidar-synth bake OUT",
         ),
+        ({"synthetic": None}, "synthetic: None; expected a bank"),
         ({"unknown": 1}, "setting of a mixture 'unknown'"),
     ],
 )
@@ -447,6 +448,15 @@ def test_mixtures_that_need_the_package_in_the_trainer_are_refused(
             epochs=1,
         )
     assert not list(tmp_path.iterdir())
+
+
+def test_a_plan_takes_a_bank_in_every_form(cases: Path, tmp_path: Path) -> None:
+    root = cases / "banks" / "all fields" / "bank"
+    hashes = [
+        write_plan({"synthetic": each}, tmp_path / "plan.npz", real=4, epochs=1)
+        for each in (root, f"file://{root}", {"root": str(root)})
+    ]
+    assert hashes[1:] == hashes[:-1]
 
 
 @pytest.mark.parametrize("labels", ["boxes", "generated", "condition"])
