@@ -471,7 +471,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
         ("lasermix", {"bands": 4}, "bands 4; expected numbers of bands"),
         ("polermix", {}, "Did you mean 'polarmix'"),
         ("best", {}, "labels='best'; expected one of 'none', 'ignore'"),
-        ("paste", {}, "no box with 5 points in 0 scans"),
+        ("paste", {}, "without real scans to take objects from. bank= gives .*town"),
         (
             "paste",
             {"real": bare},

@@ -365,8 +365,9 @@ def _collect_objects(real: Source | None, least: int) -> ObjectBank:
     try:
         return ObjectBank.from_scans([] if real is None else real, least=least)
     except DataError as error:
+        without = "labels='paste' without real scans to take objects from"
         raise ConfigError(
-            f"labels='paste': {error}",
-            hint="bank= gives other objects: ObjectBank.from_scans(source).save(path) makes one; "
-            "KITTI and the town have boxes.",
+            f"labels='paste': {error}" if real else without,
+            hint='bank= gives other objects: "town", or the file that '
+            "ObjectBank.from_scans(source).save(path) writes; KITTI and the town have boxes.",
         ) from error
