@@ -80,6 +80,23 @@ def test_a_state_without_its_plan(make: Callable[[MixedScans], Any]) -> None:
 
 
 @WAYS
+def test_a_state_of_another_version_or_seed_is_refused(
+    make: Callable[[MixedScans], Any],
+) -> None:
+    state = make_state(mixed().mixture, 1, 8)
+    for key, difference in [
+        ("version", "version 7, here 2"),
+        ("seed", "seed 7, here 0"),
+    ]:
+        with pytest.raises(
+            ConfigError, match=f"another mixture: {difference}; expected"
+        ):
+            make(mixed()).load_state_dict(state | {key: 7})
+        del state[key]
+        make(mixed()).load_state_dict(state)
+
+
+@WAYS
 def test_a_position_beyond_the_epoch_is_refused(
     make: Callable[[MixedScans], Any],
 ) -> None:

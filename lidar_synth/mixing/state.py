@@ -1,6 +1,6 @@
 """The state of a training run, for resumption, and the rank of a process.
 
-A state is ``{"version", "seed", "epoch", "position", "plan", "mixture"}``. ``plan`` is the hash of
+A state is ``{"version", "seed", "epoch", "position", "mixture", "plan"}``. ``plan`` is the hash of
 the epoch's plan, ``mixture`` everything that determines the plan in readable form, so that an error
 can name what differs.
 """
@@ -97,8 +97,8 @@ def make_state(mixture: Mixture, epoch: int, position: int) -> dict[str, Any]:
         "seed": mixture.seed,
         "epoch": epoch,
         "position": position,
-        "plan": plan.hash,
         "mixture": plan.facts,
+        "plan": plan.hash,
     }
 
 
@@ -145,19 +145,17 @@ def check_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]:
             "epoch and position, integers of 0 or more, and the hash of the plan",
         )
     epoch, position = values
-    plan = MixingPlan(mixture, epoch)
-    if state.get("plan") != plan.hash:
-        differences = list(_differences(state.get("mixture"), plan.facts, ""))
+    here = make_state(mixture, epoch, position)
+    if differences := list(_differences({**here, **state}, here, "")):
         raise ConfigError(
-            "a state of another mixture: "
-            f"{'; '.join(differences[:4]) or 'its plan has another hash'}",
+            f"a state of another mixture: {'; '.join(differences[:4])}",
             "the mixture with which the state was saved",
             f"To start epoch {epoch} of this mixture from the beginning, call set_epoch({epoch}) "
             "and load no state.",
         )
-    if position > len(plan):
+    if position > mixture.length:
         raise ConfigError(
-            f"position {position} of an epoch of {len(plan)} samples",
+            f"position {position} of an epoch of {mixture.length} samples",
             "a state of this mixture",
         )
     return epoch, position
