@@ -151,6 +151,18 @@ def test_an_augmentation_that_removes_boxes_is_refused_for_a_detector(
     assert "augment= removes the boxes" in message
 
 
+@pytest.mark.parametrize("augment", [None, "lasermix"])
+def test_scans_without_boxes_are_reported_unless_a_segmenter_is_trained(
+    augment: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    real = [street(i) for i in range(4)]
+    bare = [street(9)] if augment else [replace(street(9), boxes=None)]
+    options: dict[str, Any] = {"augment": augment, "epoch_size": 8}
+    assert not logged(mix(real, bare, **options), caplog)
+    [message] = logged(MixedScans(real, bare, **options), caplog)
+    assert "a detector would learn that their objects are background" in message
+
+
 def test_names_that_differ_by_capitals_are(caplog: pytest.LogCaptureFixture) -> None:
     real = [street(i) for i in range(4)]
     for scan in real:

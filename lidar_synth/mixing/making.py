@@ -41,6 +41,7 @@ class SampleMaker:
 
     Attributes:
         removes_labels: whether synthetic scans have no labels.
+        notices: the warnings about its scans.
 
     Raises:
         ConfigError: on a policy that a source cannot support.
@@ -68,7 +69,7 @@ class SampleMaker:
         boxes = isinstance(policy, KeepBoxes)
         # PasteObjects(clear="same") is for segmenters, which need no boxes.
         boxed = boxes or getattr(policy, "clear", "same") != "same"
-        self._notices = Notices(images, boxes, boxed)
+        self.notices = Notices(images, boxes, boxed)
         if isinstance(unboxed, str):
             from lidar_synth.labels.edit.unboxed import HANDLING  # loads networks
 
@@ -87,7 +88,7 @@ class SampleMaker:
     def real(self, scan: Scan, rng: np.random.Generator) -> Any:
         """The sample of a real scan."""
         require_finite(scan)
-        self._notices.real(scan)
+        self.notices.real(scan)
         # Copied, as a source may keep its scans in memory. Scans of the town count as real here.
         scan = replace(copy_scan(scan), domain=REAL)
         if self._augment_real:
@@ -105,7 +106,7 @@ class SampleMaker:
         if scan.boxes is not None:  # before the policy ignores labels of low confidence
             scan = self._without_unboxed(scan)
         scan = self._policies[source](scan, rng)
-        self._notices.synthetic(original, scan)
+        self.notices.synthetic(original, scan)
         if scan.boxes is not None:
             scan = self._without_unboxed(scan)
         scan = self._augmented(scan, rng)
@@ -119,7 +120,7 @@ class SampleMaker:
         if not isinstance(changed, Scan):
             raise ConfigError(f"augment= returned {type(changed).__name__}", "a Scan")
         if scan.boxes is not None and changed.boxes is None:
-            self._notices.lost_boxes(scan)
+            self.notices.lost_boxes(scan)
         return changed
 
 

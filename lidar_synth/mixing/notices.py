@@ -51,7 +51,12 @@ class Notices:
         images: whether batches are range images, in which the number of points has no meaning.
         boxes: whether scans are mixed for their boxes, so that real ones need no labels.
         boxed: whether synthetic scans are to have boxes.
+
+    Attributes:
+        segments: whether a segmenter is trained, which needs no boxes.
     """
+
+    segments = False
 
     def __init__(
         self, images: bool = False, boxes: bool = False, boxed: bool = False
@@ -158,10 +163,11 @@ class Notices:
                 "one that keeps them, with labels='boxes' or 'paste'",
                 "For a segmenter, {'paste': {'clear': 'same'}} gives scans without boxes none.",
             )
-        self._warn(
-            "augment= removes the boxes of scans: a detector would learn that their objects are "
-            "background"
-        )
+        if not self.segments:
+            self._warn(
+                "augment= removes the boxes of scans: a detector would learn that their objects "
+                "are background"
+            )
 
     def synthetic(self, original: Scan, scan: Scan) -> None:
         """Report the unboxed objects of a synthetic scan, or that synthetic scans have no boxes
@@ -174,7 +180,7 @@ class Notices:
         if scan.label is not None and self._unlabelled != "":
             self._labelled = self._labelled or bool((scan.label != IGNORE).any())
         self._compare(1, scan)
-        if scan.boxes is None and self._real_boxes:
+        if scan.boxes is None and self._real_boxes and not self.segments:
             self._warn(
                 "real scans have boxes, synthetic ones have none: a detector would learn that "
                 "their objects are background. For a detector, use labels='paste', or "

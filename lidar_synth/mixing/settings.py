@@ -177,7 +177,9 @@ def mix(
     del known["real_as_is"]
     for name in options:
         choose("argument of mix", name, known)
-    return MixedScans(reals, synthetics, **(recipe | options))
+    train = MixedScans(reals, synthetics, **(recipe | options))
+    train._maker.notices.segments = task == "segmentation"
+    return train
 
 
 def _transfer(reals: Any, synthetics: Any, alike: bool) -> Transfer | None:
