@@ -173,10 +173,12 @@ def test_boxes_that_a_trainer_does_not_know_are_refused() -> None:
         require_boxes(replace(scan, boxes=None), ["Car"])
 
 
-def test_points_are_memory_of_their_own() -> None:
+def test_points_are_those_of_the_labels_in_memory_of_their_own() -> None:
     """Trap: trainers turn points in place."""
     scan = Scans("s", 1)[0]
     points = points_of(scan)
+    assert np.array_equal(points, np.c_[scan.points, scan.reflectance])
+    assert np.array_equal(class_ids(scan, np.arange(256)), scan.label)
     before = scan.points.copy()
     points[:] = 0
     assert np.array_equal(scan.points, before)
