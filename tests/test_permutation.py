@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from lidar_synth.mixing.permutation import permute
+from lidar_synth.mixing.permutation import permute, permute_blocks
 from lidar_synth.noise import key_words
 
 KEY = st.integers(0, 2**62)
@@ -82,5 +82,10 @@ def test_an_order_is_the_same_on_every_machine() -> None:
         0,
         2,
         3,
+    ]
+    places = [permute_blocks(np.arange(18), 18, 2, 3, 1, n).tolist() for n in (1, 2)]
+    assert places == [
+        [6, 9, 0, 7, 12, 1, 8, 13, 10, 14, 15, 11, 3, 2, 4, 5, 16, 17],
+        [2, 14, 3, 0, 15, 1, 4, 5, 13, 9, 6, 11, 10, 7, 8, 12, 16, 17],
     ]
     assert key_words(1, 2, 2).tolist() == [14428589422588398592, 4881784966183016231]

@@ -90,6 +90,14 @@ def test_the_order_is_the_same_in_all_versions() -> None:
         (3, 1),
         (0, 1),
     ]
+    weighted = replace(
+        mixture(ratio=0.5, balanced=True, seed=7),
+        synthetic=tuple(PlannedSource(None, w) for w in (1.0, 2.0, 3.0)),
+    )
+    order = zip(*MixingPlan(weighted, 0).at(np.arange(12)), strict=True)
+    assert " ".join(f"{'rabc'[source]}{index}" for source, index in order) == (
+        "c1 r5 b0 r0 c0 r4 a0 r3 c2 r2 b1 r1"
+    )
 
 
 @settings(max_examples=60)
@@ -279,6 +287,16 @@ def test_reuse_is_spread_over_epochs(
     for source, lap in enumerate(mixed.laps, 1):
         whole = count_before(mixed, 4 * reuse)[source] // (reuse * lap) * lap
         assert all(counts[source, scan] == reuse for scan in range(whole))
+
+
+@pytest.mark.parametrize("ratios", [[0.1, 0.5], [0.5, 0.1]])
+def test_a_lap_is_as_long_as_the_largest_epoch(ratios: list[float]) -> None:
+    mixed = mixture(10, ratios, reuse=2)
+    assert mixed.laps == (10,)
+    for epoch in range(2):
+        made = MixingPlan(mixed, epoch)
+        drawn = made.index[made.domain].tolist()
+        assert len(set(drawn)) == len(drawn)
 
 
 def test_a_bank_begins_again() -> None:
