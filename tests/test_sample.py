@@ -72,16 +72,23 @@ def test_sample_writes_every_format_and_resumes(
             assert np.array_equal(a.label, b.label)
 
 
-def test_sample_refuses_a_folder_that_holds_samples_of_another_seed(
-    path: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("option", "values"),
+    [("seed", "45"), ("columns", ["1024", "2048"]), ("dtype", ["float32", "bfloat16"])],
+)
+def test_sample_refuses_a_folder_that_holds_samples_of_other_settings(
+    path: Path, tmp_path: Path, option: str, values: str | list[str]
 ) -> None:
     from lidar_synth.cli import app
 
-    call = ["sample", str(tmp_path / "out"), "--model", str(path), "--count", "1"]
-    assert CliRunner().invoke(app, [*call, "--seed", "4"]).exception is None
+    model = "town" if option == "columns" else str(path)  # it has several widths
+    call = ["sample", str(tmp_path / "out"), "--model", model, "--count", "1"]
+    one, other = ([*call, f"--{option}", value] for value in values)
+    assert CliRunner().invoke(app, one).exception is None
     before = (tmp_path / "out" / "000000.npz").read_bytes()
-    with pytest.raises(ConfigError, match=r"'seed': 4.*'seed': 5"):
-        CliRunner().invoke(app, [*call, "--seed", "5"], catch_exceptions=False)
+    said = f"filled with {{'{option}': .*{{'{option}': "
+    with pytest.raises(ConfigError, match=said):
+        CliRunner().invoke(app, other, catch_exceptions=False)
     assert (tmp_path / "out" / "000000.npz").read_bytes() == before
 
 
