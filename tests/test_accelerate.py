@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans, MixedStream
+from lidar_synth.mixing.epochs import CurrentEpoch
 from lidar_synth.mixing.state import make_state
 
 pytest.importorskip("accelerate")
@@ -199,3 +200,17 @@ def test_a_prepared_loader_resumes_after_its_last_batch(
     assert rest == planned(epoch, done * 4)
     next(iter(loader))
     assert loader.state_dict()["position"] == 4
+
+
+def test_an_epoch_that_is_set_after_a_used_one_is_unused() -> None:
+    from accelerate import Accelerator
+
+    Accelerator(cpu=True)
+    current = CurrentEpoch()
+    current.set(3)
+    current.of(0)
+    current.set(0)  # passes over a used epoch are counted from 0
+    current.of(0)
+    current.set(5)
+    with pytest.raises(ConfigError, match="epoch 0 where epoch 5 was set or resumed"):
+        current.set(0)

@@ -347,8 +347,9 @@ def test_workers_say_that_an_epoch_comes_again(
     assert capfd.readouterr().err.count(AGAIN) == 1
 
 
+@pytest.mark.parametrize("done", [0, 1])
 def test_resuming_in_an_epoch_is_no_repetition(
-    caught: list[warnings.WarningMessage],
+    done: int, caught: list[warnings.WarningMessage]
 ) -> None:
     for make in (
         lambda: mixed(9).batches(4),
@@ -356,7 +357,7 @@ def test_resuming_in_an_epoch_is_no_repetition(
     ):
         whole = make()
         list(whole)
-        state = whole.state_dict(1)
+        state = whole.state_dict(done)
         whole.load_state_dict(state)
         list(whole)
         assert not caught
