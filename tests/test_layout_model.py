@@ -399,6 +399,7 @@ def test_rows_of_boxes_are_encoded_and_refused() -> None:
     values = rng.uniform(
         (-80, -80, -3, 0.1, 0.1, 0.1, -np.pi), (80, 80, 3, 30, 4, 5, np.pi), (50, 7)
     ).astype(np.float32)
+    values[0, 3:6] = 4.5e-5  # less than half a step: it becomes a whole one
     boxes = Boxes(
         values, ("Cyclist", "Car") * 25, instance=np.arange(1, 51, dtype=np.int32)
     )

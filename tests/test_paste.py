@@ -76,6 +76,13 @@ def test_most_places_are_taken() -> None:
     assert placed == 20
 
 
+@pytest.mark.parametrize(("apart", "placed"), [(0.1, 1), (0.3, 2)])
+def test_pasted_objects_keep_their_distance(apart: float, placed: int) -> None:
+    """Cars side by side, 1.8 m wide."""
+    cars = [seen(car(15, y)) for y in (0.0, 1.8 + apart)]
+    assert len(paste(cast(), cars).boxes or ()) == placed
+
+
 @pytest.mark.parametrize("x", [-8.0, 8.0])
 def test_a_car_across_the_seam_is_whole(x: float) -> None:
     pasted = paste(cast(), [seen(car(x, 0, 1.0))])
