@@ -3,12 +3,13 @@ part of a scan that the camera sees."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import LARGEST_IMAGE
+from lidar_synth.files.disk import LARGEST_IMAGE, write_named_matrices
 from lidar_synth.geometry import Scan
 
 Matrix = NDArray[np.float64]
@@ -85,6 +86,25 @@ class Calibration:
                 depth[:, None] > 0, homogeneous[:, :2] / depth[:, None], np.nan
             )
         return pixels, depth
+
+
+def write_kitti_camera(
+    path: Path, camera: Calibration, transforms: dict[str, Matrix]
+) -> None:
+    """Write a camera as in KITTI: a dataset's own matrices unchanged; another camera as all four.
+
+    Args:
+        path: the file.
+        camera: the camera; its matrices are a dataset's own if all those of KITTI are among them,
+            except ``Tr_imu_to_velo``.
+        transforms: of another camera, by KITTI's names.
+
+    Raises:
+        FileError: if it cannot be written.
+    """
+    lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | transforms
+    own = lines.keys() - {"Tr_imu_to_velo"} <= camera.matrices.keys()
+    write_named_matrices(path, camera.matrices if own else lines)
 
 
 def in_view(scan: Scan, camera: Calibration) -> Scan:

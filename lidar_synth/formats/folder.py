@@ -212,10 +212,16 @@ def read_boxes(path: Path) -> Boxes | None:
     expected = "the fields of Boxes, one value per box"
     given = parse_json(read_text(beside), str(beside), expected)
     with parsing(beside, expected):
-        if not all(isinstance(name, str) for name in given["names"]):
-            raise TypeError("names that are not text")
-        with np.errstate(over="ignore"):  # Boxes refuses what is not finite
-            return Boxes(**given)
+        return boxes_from_lists(given)
+
+
+def boxes_from_lists(given: dict[str, Any]) -> Boxes:
+    """The inverse of ``boxes_as_lists``, for values that may be hostile: what is wrong raises an
+    error of any kind."""
+    if not all(isinstance(name, str) for name in given["names"]):
+        raise TypeError("names that are not text")
+    with np.errstate(over="ignore"):  # Boxes refuses what is not finite
+        return Boxes(**given)
 
 
 def write_boxes(path: Path, boxes: Boxes | None) -> None:

@@ -27,7 +27,6 @@ the folder that the command wrote, whose ``report.json`` names the dataset's roo
 The pose of a ``Scan`` is velodyne to world: pose calib_cam_to_pose[image_00] calib_cam_to_velo^-1.
 """
 
-import re
 from collections.abc import Set
 from pathlib import Path
 from typing import Any
@@ -71,6 +70,7 @@ from lidar_synth.formats.writer import (
     Picture,
     Writer,
     clear_notes,
+    drive_and_frame,
     read_notes,
     write_image,
     write_note,
@@ -243,15 +243,10 @@ class KITTI360Writer(Writer):
         self.drive = drive
 
     def _place(self, index: int, name: str | None) -> str:
-        match = re.fullmatch(
-            r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,10})", name or ""
-        )
-        drive, frame = (
-            (f"2013_05_28_drive_00{match[1]}_sync", int(match[2]))
-            if match
-            else (self.drive, index)
-        )
-        return (scans_folder(Path(), drive) / f"{frame:010d}.bin").as_posix()
+        drive = self.drive
+        if kept := drive_and_frame(name, 10):
+            drive, index = f"2013_05_28_drive_00{kept[0]}_sync", kept[1]
+        return (scans_folder(Path(), drive) / f"{index:010d}.bin").as_posix()
 
     def _put(
         self,
@@ -286,13 +281,8 @@ class KITTI360Writer(Writer):
 
     def finish(self) -> None:
         for folder in sorted((self.root / "data_poses").glob("*")):
-            notes = read_notes(folder)
+            notes, new = read_notes(folder)
             poses = read_poses(self.root, folder.name, read_calibration(self.root))
-            new = {
-                f: np.array(note["pose"])
-                for f, note in notes.items()
-                if note["pose"] is not None
-            }
             write_poses(self.root, folder.name, new)
             poses |= new
             boxes = {

@@ -72,12 +72,9 @@ def read_calibration(root: Path) -> Calibration | None:
     matrices = read_named_matrices(paths[0]) | read_named_matrices(paths[2])
     matrices["cam_to_velo"] = read_matrix(paths[1], 12).reshape(-1)
     with parsing(folder, "P_rect_00, R_rect_00, S_rect_00, image_00 and 12 numbers"):
-        if wrong := {
-            name: matrices[name].size
-            for name, size in SIZES.items()
-            if matrices[name].size != size
-        }:
-            raise ValueError(f"{wrong} values, not {SIZES}")
+        sizes = {name: matrices[name].size for name in SIZES}
+        if sizes != SIZES:
+            raise ValueError(f"{sizes} values, not {SIZES}")
         for name in ("image_00", "cam_to_velo"):
             check_rigid(homogeneous(matrices[name]), name)
         camera_from_sensor = homogeneous(matrices["R_rect_00"]) @ np.linalg.inv(
@@ -167,17 +164,12 @@ def write_poses(root: Path, drive: str, poses: dict[int, Float64Array]) -> None:
     if not poses or camera is None:
         return
     folder = root / "data_poses" / drive
-    sensor_from_imu = np.linalg.inv(imu_from_sensor(camera))
-    imu = {
-        frame: numbers((pose @ sensor_from_imu)[:3].ravel())
-        for frame, pose in poses.items()
-    }
-    cam0 = {
-        frame: numbers((pose @ camera.sensor_from_camera).ravel())
-        for frame, pose in poses.items()
-    }
-    _add_lines(folder / "poses.txt", imu)
-    _add_lines(folder / "cam0_to_world.txt", cam0)
+    for name, mount, rows in (
+        ("poses.txt", np.linalg.inv(imu_from_sensor(camera)), 3),
+        ("cam0_to_world.txt", camera.sensor_from_camera, 4),
+    ):
+        lines = {f: numbers((p @ mount)[:rows].ravel()) for f, p in poses.items()}
+        _add_lines(folder / name, lines)
 
 
 def _add_lines(path: Path, lines: dict[int, str]) -> None:
@@ -217,10 +209,10 @@ def fill_poses(
             continue
         first = int(known[after - 1])
         last = int(known[after])
-        if np.linalg.norm(poses[last][:3, 3] - poses[first][:3, 3]) <= STILL:
+        start = poses[first][:3, 3]
+        end = poses[last][:3, 3]
+        if np.linalg.norm(end - start) <= STILL:
             share = (frame - first) / (last - first)
             filled[frame] = poses[first if share < 0.5 else last].copy()
-            start = poses[first][:3, 3]
-            end = poses[last][:3, 3]
             filled[frame][:3, 3] = (1 - share) * start + share * end
     return filled

@@ -38,38 +38,14 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
     Raises:
         DataError: as ``read_label_2``.
     """
-    names, values = _split_fields(text, path)
-    ignored = np.array([name == "DontCare" for name in names], bool)
-    _check_values(values, ignored, path)
-    truncation, occlusion, alpha, image_box, size, floor, turn = np.split(
-        values, [1, 2, 3, 7, 10, 13], axis=1
-    )
-    keep = ~ignored
-    return Boxes(
-        boxes_from_camera(floor[keep], size[keep], turn[keep, 0], camera),
-        tuple(compress(names, keep)),
-        truncation=truncation[keep, 0].astype(np.float32),
-        occlusion=occlusion[keep, 0].astype(np.int8),
-        image_box=image_box[keep].astype(np.float32),
-        alpha=alpha[keep, 0].astype(np.float32),
-        dont_care=image_box[ignored].astype(np.float32),
-    )
-
-
-def _split_fields(text: str, path: Path) -> tuple[list[str], Float64Array]:
-    """The names, and the (M, 14) numbers that follow them."""
     rows = [line.split() for line in text.splitlines() if line.strip()]
     bad = [row for row in rows if len(row) not in (15, 16)]
     if bad:
         raise DataError(f"{path}: a line with {len(bad[0])} fields", _FIELDS)
     with parsing(path, _FIELDS):
         values = np.array([row[1:15] for row in rows], np.float64).reshape(-1, 14)
-    return [row[0] for row in rows], values
-
-
-def _check_values(values: Float64Array, ignored: NDArray[np.bool_], path: Path) -> None:
-    """Refuse impossible values: not finite, far beyond any sensor's range, or wrong sizes and
-    occlusions."""
+    names = [row[0] for row in rows]
+    ignored = np.array([name == "DontCare" for name in names], bool)
     within = np.abs(values) <= FARTHEST  # NaN is not
     sizes = (values[:, 7:10] > 0).all(axis=1) | ignored
     sound = within.all(axis=1) & np.isin(values[:, 1], (-1, 0, 1, 2, 3)) & sizes
@@ -80,6 +56,19 @@ def _check_values(values: Float64Array, ignored: NDArray[np.bool_], path: Path) 
             "finite numbers, a size above 0 and an occlusion of 0 to 3",
         )
 
+    truncation, occlusion, alpha, image_box, size, floor, turn = np.split(
+        values, [1, 2, 3, 7, 10, 13], axis=1
+    )
+    keep = ~ignored
+    return Boxes(
+        boxes_from_camera(floor[keep], size[keep], turn[keep, 0], camera),
+        tuple(compress(names, keep)),
+        truncation=truncation[keep, 0],
+        occlusion=occlusion[keep, 0],
+        image_box=image_box[keep],
+        alpha=alpha[keep, 0],
+        dont_care=image_box[ignored],
+    )
 
 def boxes_from_camera(
     floor: Float64Array,
@@ -96,7 +85,7 @@ def boxes_from_camera(
         camera: the calibration.
     """
     height, width, length = size.T
-    centre = floor - np.stack([0 * height, height / 2, 0 * height], -1)
+    centre = floor - np.outer(height, (0, 0.5, 0))
     back = camera.sensor_from_camera
     ahead = (
         np.stack([np.cos(rotation_y), 0 * rotation_y, -np.sin(rotation_y)], -1)
@@ -118,7 +107,7 @@ def boxes_to_camera(
     to = camera.camera_from_sensor
     centre = values[:, :3] @ to[:3, :3].T + to[:3, 3]
     ahead = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], -1) @ to[:3, :3].T
-    floor = centre + np.stack([0 * height, height / 2, 0 * height], -1)
+    floor = centre + np.outer(height, (0, 0.5, 0))
     return (
         floor,
         np.stack([height, width, length], -1),

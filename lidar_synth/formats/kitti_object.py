@@ -26,10 +26,14 @@ from lidar_synth.files.disk import (
     read_named_matrices,
     read_text,
     write_file,
-    write_named_matrices,
 )
 from lidar_synth.files.parsing import picture_size
-from lidar_synth.formats.calibration import Calibration, homogeneous, ideal_camera
+from lidar_synth.formats.calibration import (
+    Calibration,
+    homogeneous,
+    ideal_camera,
+    write_kitti_camera,
+)
 from lidar_synth.formats.camera_boxes import IMAGE_SIZE, CameraBoxes, assumed_size
 from lidar_synth.formats.kitti_labels import in_image, read_label_2, write_label_2
 from lidar_synth.formats.points import check_scale, read_points
@@ -258,7 +262,15 @@ class KITTIObjectWriter(Writer):
         if folder.name == "training" and scan.boxes is not None:
             write_label_2(folder / "label_2" / f"{frame}.txt", scan.boxes, camera)
         write_image(folder / "image_2" / f"{frame}.png", picture)
-        write_calibration(folder / "calib" / f"{frame}.txt", camera)
+        write_kitti_camera(
+            folder / "calib" / f"{frame}.txt",
+            camera,
+            {
+                "R0_rect": np.eye(3),
+                "Tr_velo_to_cam": camera.camera_from_sensor[:3],
+                "Tr_imu_to_velo": np.eye(4)[:3],
+            },
+        )
         self._write_points(path, scan)
 
     def loses(self, scan: Scan, camera: Calibration | None) -> list[str]:
@@ -272,9 +284,10 @@ class KITTIObjectWriter(Writer):
         return lost
 
     def finish(self) -> None:
-        for split, (part, *_) in SPLITS.items():
+        parts = {"train": "training", "trainval": "training", "test": "testing"}
+        for split, part in parts.items():
             folder = self.root / part / "velodyne"
-            if split in ("train", "trainval", "test") and folder.is_dir():
+            if folder.is_dir():
                 frames = [p.stem for p in list_files(folder, ".bin")]
                 write_file(
                     self.root / "ImageSets" / f"{split}.txt",
@@ -317,15 +330,3 @@ def read_calibration(
         return Calibration(
             matrices["P2"].reshape(3, 4), camera_from_sensor, image_size, matrices
         )
-
-
-def write_calibration(path: Path, camera: Calibration) -> None:
-    """The inverse of ``read_calibration``: KITTI's own matrices unchanged; another camera is
-    written as all four."""
-    own = {"P0", "P1", "P2", "P3", "R0_rect", "Tr_velo_to_cam"} <= set(camera.matrices)
-    lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | {
-        "R0_rect": np.eye(3),
-        "Tr_velo_to_cam": camera.camera_from_sensor[:3],
-        "Tr_imu_to_velo": np.eye(4)[:3],
-    }
-    write_named_matrices(path, camera.matrices if own else lines)

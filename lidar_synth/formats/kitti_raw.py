@@ -15,6 +15,7 @@ centre of the box's *floor* and rz the yaw. The package reads this layout and do
 import xml.etree.ElementTree as ElementTree
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -173,9 +174,7 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
         FileError: if it cannot be read.
         DataError: if it is not a tracklet file.
     """
-    rows: dict[int, list[tuple[tuple[float, ...], str, int, int, int]]] = defaultdict(
-        list
-    )
+    rows: dict[int, list[Any]] = defaultdict(list)
     with parsing(path, "KITTI's tracklet_labels.xml"):
         tracklets = ElementTree.fromstring(read_file(path)).findall("tracklets/item")
         for instance, tracklet in enumerate(tracklets):
@@ -217,10 +216,10 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
             )
         with name_errors(path):
             boxes[frame] = Boxes(
-                np.array(values, np.float32),
+                np.array(values),
                 names,
-                truncation=np.array(truncation, np.float32),
-                occlusion=np.array(occlusion, np.int8),
-                instance=np.array(instances, np.int32),
+                truncation=np.array(truncation),
+                occlusion=np.array(occlusion),
+                instance=np.array(instances),
             )
     return boxes

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import SKIP_HINT, read_file
 from lidar_synth.files.parsing import MOST_BYTES
 from lidar_synth.files.pickles import (
@@ -108,24 +108,10 @@ def read_table(
     content = read_file(path, EXPECTED, MOST_BYTES)
     if content.startswith(GZIP):
         content = _gunzip(content, path)
-    try:
+    with parsing(path, EXPECTED, SKIP_HINT):
         table = _columns(
             parse_pickle(content, KNOWN, str(path), EXPECTED), {*columns, *optional}
         )
-    # What a pickle causes that is no table: values of other kinds, lengths that do not fit.
-    except (
-        ValueError,
-        TypeError,
-        IndexError,
-        KeyError,
-        AttributeError,
-        OverflowError,
-    ) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(
-            f"{path} holds another table ({error})", EXPECTED, SKIP_HINT
-        ) from error
     if missing := [name for name in columns if name not in table]:
         raise DataError(
             f"{path} has no column {', '.join(missing)}",

@@ -84,23 +84,20 @@ def read_cuboids(path: Path, pose: NDArray[np.float64], other_sensor: int) -> Bo
     names = ["Cyclist" if pair == CYCLIST else BOXES[pair[0]] for pair in pairs]
     kept = np.array([name is not None for name in names], bool)
     kept &= table.get("cuboids.sensor_id", np.full(len(labels), -1)) != other_sensor
-    values = np.stack([table[name] for name in numbers], axis=-1).astype(np.float64)
-    values = values[kept]
+    values = np.stack([table[name][kept] for name in numbers], -1).astype(np.float64)
     # PandaSet's yaw turns a box whose length is along y.
     with np.errstate(invalid="ignore"):  # Boxes refuses what is not finite
-        heading = (
-            np.stack(
-                [-np.sin(values[:, 6]), np.cos(values[:, 6]), np.zeros(len(values))], -1
-            )
-            @ pose[:3, :3]
-        )
-    values[:, :3] = from_world(values[:, :3], pose)
-    values[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
-    instance = [
-        crc32(str(uuid).encode("utf-8", "replace")) >> 1 for uuid in table["uuid"][kept]
-    ]
+        across = np.stack([-np.sin(values[:, 6]), np.cos(values[:, 6])], -1)
+        heading = across @ pose[:2, :3]
+    yaw = np.arctan2(heading[:, 1], heading[:, 0])
+    instance = list(map(track_number, table["uuid"][kept]))
     return Boxes(
-        values.astype(np.float32),
+        np.column_stack([from_world(values[:, :3], pose), values[:, 3:6], yaw]),
         tuple(np.array(names, object)[kept]),
-        instance=np.array(instance, np.int32),
+        instance=np.array(instance),
     )
+
+
+def track_number(name: object) -> int:
+    """The instance of a track by its name, the same in every frame."""
+    return crc32(str(name).encode("utf-8", "replace")) >> 1

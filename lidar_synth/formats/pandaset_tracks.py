@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import name_errors, read_text
 from lidar_synth.files.parsing import parse_json
+from lidar_synth.geometry.motion import pose_of
 
 Matrix = NDArray[np.float64]
 
@@ -141,9 +142,4 @@ def _transform(pose: Any) -> Matrix:
         raise DataError(
             f"a heading of length {np.linalg.norm(quaternion):g}", "a unit quaternion"
         )
-    from scipy.spatial.transform import Rotation  # takes long to import
-
-    result = np.eye(4)
-    result[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
-    result[:3, 3] = _numbers(pose.get("position"), "x", "y", "z")
-    return result
+    return pose_of([*_numbers(pose.get("position"), "x", "y", "z"), *quaternion])

@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +32,11 @@ from lidar_synth.errors import (
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.folder import rows_of_rings
 from lidar_synth.formats.nuscenes import RINGS, drop_nearest
+from lidar_synth.formats.pandaset_cuboids import track_number
 from lidar_synth.formats.points import check_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry import Boxes, Scan, Sensor
-from lidar_synth.geometry.motion import from_world
+from lidar_synth.geometry.motion import from_world, pose_of
 
 SYNC = "sync.arrow"
 EGO = "ego_state_se3"
@@ -162,7 +162,7 @@ class Py123D(ScanFiles):
             if frame.lidar == MERGED and "ids" in cloud:
                 own = cloud["ids"] == number
                 cloud = {name: values[own] for name, values in cloud.items()}
-            mount = _ahead(_transform(mounts[number]["lidar_to_imu_se3"]))
+            mount = _ahead(pose_of(mounts[number]["lidar_to_imu_se3"]))
         points = from_world(cloud["xyz"].astype(np.float64), mount).astype(np.float32)
         grey = cloud.get("intensity", np.zeros(len(points))).astype(np.float32)
         check_points(points, grey, str(path), 255)
@@ -181,7 +181,7 @@ class Py123D(ScanFiles):
             scan.label = table and table.decode(scan.raw_label, str(path))
         if frame.rows.get(EGO) is not None:
             ego, _ = _row(frame, EGO)
-            scan.pose = _transform(ego["imu_se3"]) @ mount
+            scan.pose = pose_of(ego["imu_se3"]) @ mount
             if "timestamps" in cloud:
                 since = cloud["timestamps"].astype(np.int64) - ego["timestamp_us"]
                 scan.time = (since / 1e6).astype(np.float32)
@@ -304,7 +304,7 @@ def _boxes(
     """A frame's boxes in the frame of the sensor; of a class of no table, they are ``Misc``."""
     names = (_table(OBJECTS, facts["box_detection_label_class"]) or "").split()
     found = [
-        (name, box, crc32(str(token).encode()) >> 1)
+        (name, box, track_number(token))
         for box, label, token in zip(
             row["bounding_box_se3"], row["label"], row["track_token"], strict=True
         )
@@ -313,12 +313,12 @@ def _boxes(
     to_sensor = np.linalg.inv(pose)
     values = []
     for _, box, _ in found:
-        place = to_sensor @ _transform(box[:7])
+        place = to_sensor @ pose_of(box[:7])
         values.append([*place[:3, 3], *box[7:], np.arctan2(place[1, 0], place[0, 0])])
     return Boxes(
-        np.array(values, np.float32),
+        np.array(values),
         tuple(name for name, _, _ in found),
-        instance=np.array([token for _, _, token in found], np.int32),
+        instance=np.array([token for _, _, token in found]),
     )
 
 
@@ -335,17 +335,7 @@ def _ahead(mount: NDArray[np.float64]) -> NDArray[np.float64]:
     """A sensor's frame in the vehicle's, turned about its z so that x is ahead."""
     quarters = np.round(np.arctan2(mount[1, 0], mount[0, 0]) / (np.pi / 2))
     half = -quarters * np.pi / 4
-    return mount @ _transform([0, 0, 0, np.cos(half), 0, 0, np.sin(half)])
-
-
-def _transform(values: list[float]) -> NDArray[np.float64]:
-    """(4, 4) of x, y, z, qw, qx, qy, qz."""
-    result = np.eye(4)
-    result[:3, 3] = values[:3]
-    scalar, *vector = np.array(values[3:]) / np.linalg.norm(values[3:])
-    cross = np.cross(np.eye(3), vector)
-    result[:3, :3] += 2 * (scalar * cross + cross @ cross)
-    return result
+    return mount @ pose_of([0, 0, 0, np.cos(half), 0, 0, np.sin(half)])
 
 
 def _facts(table: Any) -> dict[str, Any]:

@@ -12,7 +12,6 @@ Layout (http://www.semantic-kitti.org/dataset.html)::
 The pose of a ``Scan`` is sensor to world: Tr^-1 pose Tr.
 """
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,6 @@ from lidar_synth.files.disk import (
     read_named_matrices,
     read_text,
     write_file,
-    write_named_matrices,
 )
 from lidar_synth.files.parsing import picture_size
 from lidar_synth.formats.calibration import (
@@ -38,6 +36,7 @@ from lidar_synth.formats.calibration import (
     check_rigid,
     homogeneous,
     ideal_camera,
+    write_kitti_camera,
 )
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import check_scale, read_points
@@ -47,6 +46,7 @@ from lidar_synth.formats.writer import (
     Picture,
     Writer,
     clear_notes,
+    drive_and_frame,
     read_notes,
     write_image,
     write_note,
@@ -196,10 +196,8 @@ class SemanticKITTIWriter(Writer):
 
     def _place(self, index: int, name: str | None) -> str:
         # Six digits, as the dataset has: poses.txt has a line for every frame up to the last.
-        match = re.fullmatch(
-            r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,6})", name or ""
-        )
-        sequence, frame = (match[1], int(match[2])) if match else (self.sequence, index)
+        kept = drive_and_frame(name, 6)
+        sequence, frame = kept or (self.sequence, index)
         return f"sequences/{sequence}/velodyne/{frame:06d}.bin"
 
     def _put(
@@ -213,12 +211,10 @@ class SemanticKITTIWriter(Writer):
         frame = path.stem
         if folder.name not in self._carried:
             if not (folder / "calib.txt").is_file():
-                write_calibration(folder, camera or KITTI_CAMERA)
-            write_note(
-                folder,
-                int(frame),
-                {"pose": None if scan.pose is None else scan.pose.tolist()},
-            )
+                known = camera or KITTI_CAMERA
+                transform = {"Tr": known.camera_from_sensor[:3]}
+                write_kitti_camera(folder / "calib.txt", known, transform)
+            write_note(folder, int(frame), {"pose": scan.pose})
         if picture is not None:
             write_image(folder / "image_2" / f"{frame}.png", picture)
         write_labels(
@@ -231,11 +227,8 @@ class SemanticKITTIWriter(Writer):
             return ["times.txt: the times of the scans are unknown"]
         missing = []
         for sequence in sorted({name.split("/")[0] for name in source.ids}):
-            if not all(
-                self._keeps(i, n)
-                for i, n in enumerate(source.ids)
-                if n.startswith(f"{sequence}/")
-            ):
+            names = [n for n in source.ids if n.startswith(f"{sequence}/")]
+            if not all((drive_and_frame(n, 6) or [""])[0] == sequence for n in names):
                 missing.append(
                     f"calibration, poses and times of sequence {sequence}: its scans are renumbered"
                 )
@@ -253,25 +246,10 @@ class SemanticKITTIWriter(Writer):
                     )
         return missing
 
-    def _keeps(self, index: int, name: str) -> bool:
-        """Whether a scan of SemanticKITTI keeps its sequence and its frame."""
-        path = self.path(index, name)
-        sequence, frame = name.split("/")
-        return (
-            path.parents[1].name == sequence
-            and frame.isdigit()
-            and int(path.stem) == int(frame)
-        )
-
     def finish(self) -> None:
         for folder in sorted((self.root / "sequences").glob("*")):
-            notes = read_notes(folder)
+            notes, poses = read_notes(folder)
             camera = read_calibration(folder)
-            poses = {
-                f: np.array(note["pose"])
-                for f, note in notes.items()
-                if note["pose"] is not None
-            }
             if notes and camera is not None:
                 write_poses(folder, camera, poses, frames=1 + max(notes))
             clear_notes(folder)
@@ -307,16 +285,6 @@ def read_calibration(folder: Path) -> Calibration | None:
         return Calibration(
             matrices["P2"].reshape(3, 4), homogeneous(matrices["Tr"]), size, matrices
         )
-
-
-def write_calibration(folder: Path, camera: Calibration) -> None:
-    """The inverse of ``read_calibration``: SemanticKITTI's own matrices unchanged; another camera
-    as all four."""
-    own = {"Tr", "P0", "P1", "P2", "P3"} <= set(camera.matrices)
-    lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | {
-        "Tr": camera.camera_from_sensor[:3]
-    }
-    write_named_matrices(folder / "calib.txt", camera.matrices if own else lines)
 
 
 def read_poses(

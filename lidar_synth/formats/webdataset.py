@@ -42,12 +42,12 @@ from lidar_synth.files.disk import (
 )
 from lidar_synth.files.parsing import TarMember, parse_json, parse_npy
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.folder import boxes_as_lists
+from lidar_synth.formats.folder import boxes_as_lists, boxes_from_lists
 from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import DETAILS, NOTES, FileWriter, clear_notes
-from lidar_synth.geometry import Boxes, Scan, Sensor
+from lidar_synth.geometry import Scan, Sensor
 
 SUFFIX = ".tar"
 
@@ -223,10 +223,13 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
     with parsing(where, "the members that this package writes", SKIP_HINT):
         boxes = None
         if "boxes" in arrays:
-            values = arrays.pop("boxes")
-            other = facts.get("boxes", {})  # earlier versions did not write them
-            with np.errstate(over="ignore"):  # Boxes refuses what is not finite
-                boxes = Boxes(values, _texts(facts["names"]), **other)
+            boxes = boxes_from_lists(
+                {
+                    **facts.get("boxes", {}),  # earlier versions did not write them
+                    "values": arrays.pop("boxes"),
+                    "names": facts["names"],
+                }
+            )
         points = arrays.pop("points")
         arrays |= {"points": points[:, :3], "reflectance": points[:, 3]}
         if "labelled" in facts and facts["labelled"] is False:
@@ -247,12 +250,6 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
     scan.id = unquote(key)
     check_scan(scan, where)
     return scan
-
-
-def _texts(names: Any) -> tuple[str, ...]:
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise TypeError("names that are not text")
-    return tuple(names)
 
 
 def _content(file: BinaryIO, offset: int, size: int) -> bytes:

@@ -8,6 +8,7 @@ gathered by ``finish``, which one process calls at the end.
 """
 
 import json
+import re
 import shutil
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
@@ -302,17 +303,31 @@ def write_image(path: Path, picture: Picture) -> None:
     write_file(path, lambda file: opened.convert("RGB").save(file, "PNG"))
 
 
+def drive_and_frame(name: str | None, digits: int) -> tuple[str, int] | None:
+    """The drive of a scan, two digits, and its frame, by its id in SemanticKITTI (``NN/FFFFFF``) or
+    KITTI-360; None if the id is another, or its frame has more digits."""
+    start = "(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?"
+    match = re.fullmatch(f"{start}/0*([0-9]{{1,{digits}}})", name or "")
+    return (match[1], int(match[2])) if match else None
+
+
 def write_note(folder: Path, frame: int, facts: dict[str, Any]) -> None:
-    """Note the facts of one frame for files of the whole folder (plain values; floats stay exact).
+    """Note the facts of one frame for files of the whole folder (plain values and arrays; floats
+    stay exact), among them its ``pose`` or None.
 
     Raises:
         FileError: if it cannot be written.
     """
-    write_file(folder / NOTES / f"{frame:010d}.json", json.dumps(facts).encode())
+    write_file(
+        folder / NOTES / f"{frame:010d}.json",
+        json.dumps(facts, default=np.ndarray.tolist).encode(),
+    )
 
 
-def read_notes(folder: Path) -> dict[int, dict[str, Any]]:
-    """{frame: facts} of the notes in a folder.
+def read_notes(
+    folder: Path,
+) -> tuple[dict[int, dict[str, Any]], dict[int, NDArray[np.float64]]]:
+    """{frame: facts} of the notes in a folder, and {frame: (4, 4)} their poses.
 
     Raises:
         DataError: on a damaged note.
@@ -325,7 +340,8 @@ def read_notes(folder: Path) -> dict[int, dict[str, Any]]:
             f"{path} is not a note of this package", hint=f"Remove {path.parent}."
         ):
             notes[int(path.stem)] = parse_json(read_text(path), str(path))
-    return notes
+    known = {f: note["pose"] for f, note in notes.items() if note["pose"] is not None}
+    return notes, {frame: np.array(pose) for frame, pose in known.items()}
 
 
 def clear_notes(folder: Path) -> None:

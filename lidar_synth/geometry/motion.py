@@ -5,6 +5,8 @@ A rotating sensor measures a scan over 0.1 s, in which a car drives one or two m
 before and after, each point has a pose of its own, the one at the time of its measurement.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lidar_synth.errors import DataError
@@ -95,3 +97,14 @@ def from_world(points: Float64Array, poses: Float64Array) -> Float64Array:
     return np.asarray(
         np.einsum("...ji,...j->...i", poses[..., :3, :3], moved), np.float64
     )
+
+
+def pose_of(values: Sequence[float]) -> Float64Array:
+    """(4, 4) pose of a position and a quaternion: x, y, z in metres, then w, x, y, z of any
+    length."""
+    pose = np.eye(4)
+    pose[:3, 3] = values[:3]
+    scalar, *vector = np.array(values[3:]) / np.linalg.norm(values[3:])
+    cross = np.cross(np.eye(3), vector)
+    pose[:3, :3] += 2 * (scalar * cross + cross @ cross)
+    return pose
