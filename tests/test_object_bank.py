@@ -169,10 +169,14 @@ def test_a_bank_needs_boxes_and_one_sensor() -> None:
 def test_without_instances_an_object_is_what_stands_in_its_box() -> None:
     scan = cast([car(9, 3)])
     scan.boxes.values[0, 3:6] += 0.4  # as people draw them, with some road
+    none = np.zeros(len(scan), np.int32)
     for bare in (
         replace(scan, instance=None),
+        replace(scan, instance=none),
         replace(scan, instance=None, label=None),
     ):
+        tracked = merge_scans(bare, []).instance == 1
+        assert tracked.sum() == len(objects_of(bare)[0].scan)
         [found] = objects_of(bare).values()
         assert (found.scan.label == CAR).all()
         above = scan.points[scan.instance == 1][:, 2] > -HEIGHT + 0.1

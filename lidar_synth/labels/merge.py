@@ -75,11 +75,11 @@ def _complete(scan: Scan) -> Scan:
         if scan.confidence is None
         else scan.confidence
     )
-    instance = _of_tracks(scan) if scan.instance is None else scan.instance
-    if scan.instance is not None and scan.raw_label is not None and scan.boxes is None:
-        instance = number_instances(
-            scan
-        )  # not with boxes, which refer to the old numbers
+    instance = scan.instance
+    if instance is None or not instance.any():
+        instance = _of_tracks(scan)
+    elif scan.raw_label is not None and scan.boxes is None:  # which has the old numbers
+        instance = number_instances(scan)
     return replace(scan, label=label, confidence=confidence, instance=instance)
 
 

@@ -143,9 +143,9 @@ def enlarge_boxes(scan: Scan) -> Scan:
 
 def find_returns(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     """(N,) True for the returns of the object in one box: those of its instance, or those above the
-    ground."""
-    has_instance = scan.instance is not None and box.instance[0] > 0
-    return _instance(scan, box) if has_instance else _standing(scan, box)
+    ground if no point of the scan has one."""
+    numbered = box.instance[0] > 0 and scan.instance is not None and scan.instance.any()
+    return _instance(scan, box) if numbered else _standing(scan, box)
 
 
 def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
