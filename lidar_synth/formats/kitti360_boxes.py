@@ -111,12 +111,13 @@ class WorldBoxes:
         Args:
             frame: number of the frame.
             pose: (4, 4) sensor to world.
-            range_max: maximum distance of an object's centre, metres.
+            range_max: of the sensor, metres. Half the diagonal of an object may lie beyond it.
         """
         if not _cover(self.annotated, frame).any():
             return None
         now = _cover(self.windows, frame) & (
-            np.linalg.norm(self.transforms[:, :3, 3] - pose[:3, 3], axis=1) <= range_max
+            np.linalg.norm(self.transforms[:, :3, 3] - pose[:3, 3], axis=1)
+            <= range_max + np.linalg.norm(self.transforms[:, :3, :3], axis=(1, 2)) / 2
         )
         local = np.linalg.inv(pose) @ self.transforms[now]
         size = np.linalg.norm(local[:, :3, :3], axis=1)
