@@ -252,6 +252,9 @@ SEMANTIC_KITTI = Taxonomy(
 """SemanticKITTI's ids: ``learning_map`` of semantic-kitti.yaml and its inverse to the static
 classes."""
 
+MOVING = 252
+"""First of SemanticKITTI's ids of moving objects."""
+
 MAX_INSTANCES = 1000
 """An instance of KITTI-360 is id * 1000 + n, as in the dataset's label images and tools."""
 

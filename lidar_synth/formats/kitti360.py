@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import KITTI360 as CLASSES
-from lidar_synth.datasets.classes import MAX_INSTANCES
+from lidar_synth.datasets.classes import MAX_INSTANCES, MOVING
 from lidar_synth.datasets.recordings import KITTI360_SPLITS
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import list_files, read_file, read_values
@@ -302,7 +302,7 @@ class KITTI360Writer(Writer):
 
 def label_values(scan: Scan) -> NDArray[np.uint32]:
     """(N,) values of a scan's label file: KITTI-360's id, and above it id * 1000 + n, which labels
-    and boxes use.
+    and boxes use. Moving objects, which SemanticKITTI counts apart, count from 999 down.
 
     Raises:
         DataError: on a train id or an instance that the file cannot hold.
@@ -313,9 +313,10 @@ def label_values(scan: Scan) -> NDArray[np.uint32]:
     ids = labels & 0xFFFF
     instances = labels >> 16
     local = (instances > 0) & (instances < MAX_INSTANCES)
-    return np.where(
-        local, ids | ((ids * MAX_INSTANCES + instances) << 16), labels
-    ).astype(np.uint32)
+    if scan.raw_label is not None and scan.boxes is None:  # which have the old numbers
+        moving = local & (scan.raw_label & 0xFFFF >= MOVING)
+        instances = np.where(moving, MAX_INSTANCES - instances, instances)
+    return np.asarray(ids | (instances + local * ids * MAX_INSTANCES) << 16, np.uint32)
 
 
 def _facts(scan: Scan) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import MAX_INSTANCES
+from lidar_synth.datasets.classes import MAX_INSTANCES, MOVING
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.kitti360 import label_values
 from lidar_synth.geometry import Scan
@@ -42,7 +42,6 @@ coarser than ``SPACING``."""
 NEAREST = 3.0
 """Minimum distance from which a point is accumulated, metres."""
 
-_MOVING = 252  # first of SemanticKITTI's ids of moving objects
 _POSE_ERRORS = 360  # part of the key of their random numbers
 
 
@@ -143,7 +142,7 @@ def _measured(scan: Scan, frame: int, rng: np.random.Generator) -> Cloud:
         "instance": np.where(instance > 0, instance, semantic * MAX_INSTANCES),
         "confidence": np.ones(len(values), np.float32),
         "timestamp": np.full(len(values), frame, np.int32),
-        "moving": (scan.raw_label[near] & 0xFFFF) >= _MOVING,
+        "moving": (scan.raw_label[near] & 0xFFFF) >= MOVING,
         "range": distance[near],
     }
 
