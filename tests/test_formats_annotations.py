@@ -447,7 +447,7 @@ def test_kitti360_boxes_survive_the_conversion_to_the_world_frame(
         )
         assert (
             same(scan.boxes.instance, expected.boxes.instance)
-            and (scan.boxes.instance >= 24_000).all()
+            and (scan.boxes.instance >= 1000).all()
         )
 
 
@@ -488,7 +488,7 @@ def test_boxes_of_kitti360_are_known_where_the_car_stands_still_and_in_windows_a
     tmp_path: Path,
 ) -> None:
     scans = [replace(some_scan(i, count=40), pose=a_pose(0)) for i in range(4)]
-    scans[1].boxes = None  # a frame without an object is written like this
+    scans[1].boxes = Boxes(np.zeros((0, 7)), ())
     write_all("kitti360", tmp_path, scans, calibration=some_camera())
     poses = tmp_path / "data_poses" / "2013_05_28_drive_0000_sync" / "poses.txt"
     first, *left_out, last = poses.read_text().splitlines(True)

@@ -42,8 +42,8 @@ from lidar_synth.files.disk import list_files, read_file, read_values
 from lidar_synth.files.parsing import read_facts
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import NAME
+from lidar_synth.formats.folder import boxes_as_lists
 from lidar_synth.formats.kitti360_boxes import (
-    MOST_INSTANCE,
     OBJECTS,
     WorldBoxes,
     read_boxes,
@@ -286,12 +286,9 @@ class KITTI360Writer(Writer):
             write_poses(self.root, folder.name, new)
             poses |= new
             boxes = {
-                f: (
-                    Boxes(note["boxes"], note["names"], instance=note["instance"]),
-                    poses[f],
-                )
+                f: (Boxes(**note["boxes"]), poses[f])
                 for f, note in notes.items()
-                if note["boxes"] is not None
+                if note["boxes"]
             }
             if boxes:
                 write_boxes(
@@ -320,26 +317,17 @@ def label_values(scan: Scan) -> NDArray[np.uint32]:
 
 
 def _facts(scan: Scan) -> dict[str, Any]:
-    """The note of a scan.
-
-    Raises:
-        DataError: on an instance of a box that the file cannot hold.
-    """
-    boxes = scan.boxes
+    """The note of a scan. Boxes have the instances of their points in its label file."""
     pose = scan.pose
-    if boxes is not None and boxes.instance.max(initial=0) > MOST_INSTANCE:
-        raise DataError(
-            f"scan {scan.id!r}: a box of instance {boxes.instance.max()}",
-            f"at most {MOST_INSTANCE}",
-        )
-    if boxes is not None and pose is None:
-        pose = np.eye(4)
-    return {
-        "pose": None if pose is None else pose.tolist(),
-        "boxes": None if boxes is None else boxes.values.tolist(),
-        "names": [] if boxes is None else boxes.names,
-        "instance": [] if boxes is None else boxes.instance.tolist(),
-    }
+    boxes = None
+    if scan.boxes is not None:
+        pose = np.eye(4) if pose is None else pose
+        boxes = boxes_as_lists(scan.boxes)
+        if scan.label is not None and scan.instance is not None:
+            written = (label_values(scan) >> 16).tolist()
+            numbers = dict(zip(scan.instance.tolist(), written, strict=True))
+            boxes["instance"] = [numbers.get(n, n) for n in boxes["instance"]]
+    return {"pose": pose, "boxes": boxes}
 
 
 def folders_of(path: Path) -> tuple[Path, Path | None]:

@@ -61,11 +61,12 @@ BY_NAME = {
     "Cyclist": 20,
     "Tram": 33,
     "Misc": 36,
+    "DontCare": 37,
 }
 """{KITTI's name: semanticId to write}. Lossy: vans become cars, and sitting persons pedestrians."""
 
-MOST_INSTANCE = (1 << 31) - 1 - 100 * MAX_INSTANCES
-"""Maximum instance of a box to write: the reader adds its class to it."""
+NONE = Boxes(np.array([(0, 0, 0, 1, 1, 1, 0)]), ("DontCare",))
+"""Written for a frame without boxes: of a class that is skipped, it says that there are none."""
 
 CUBE = np.array(
     [
@@ -95,8 +96,8 @@ class WorldBoxes:
         instances: (M,) int32.
         windows: (M, 2) int64 first and last frame in which an object may be listed; the same for a
             moving object.
-        annotated: (K, 2) int64 first and last frame in which the static objects of a window may be
-            listed, whatever their class.
+        annotated: (K, 2) int64 first and last frames between which objects may be listed, whatever
+            their class.
     """
 
     transforms: Float64Array
@@ -158,7 +159,7 @@ def read_boxes(path: Path) -> WorldBoxes:
                     int(node.findtext(t) or -1)
                     for t in ("timestamp", "start_frame", "end_frame")
                 )
-                span = (first - MARGIN, last + MARGIN)
+                span = (first - MARGIN, last + MARGIN) if frame < 0 else (frame, frame)
                 annotated.add(span)
                 if semantic in OBJECTS:
                     _, image_id, name = OBJECTS[semantic]
@@ -167,10 +168,11 @@ def read_boxes(path: Path) -> WorldBoxes:
                         @ _unit_cube(_matrix(node, "vertices", (-1, 3)))
                     )
                     names.append(name)
-                    instances.append(
-                        image_id * MAX_INSTANCES + int(node.findtext("instanceId") or 0)
-                    )
-                    windows.append((frame, frame) if frame >= 0 else span)
+                    number = int(node.findtext("instanceId") or 0)
+                    if number < MAX_INSTANCES:
+                        number += image_id * MAX_INSTANCES
+                    instances.append(number)
+                    windows.append(span)
                 node.clear()
         found = WorldBoxes(
             np.array(transforms).reshape(-1, 4, 4),
@@ -223,7 +225,7 @@ def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, Float64Array]]) ->
     objects = [
         node
         for frame, (boxes, pose) in sorted(frames.items())
-        for node in _objects(frame, boxes, pose)
+        for node in _objects(frame, boxes if len(boxes) else NONE, pose)
     ]
     # In the order of frames, so that a resumed export has the bytes of one in a single run.
     root[:] = sorted(
@@ -264,7 +266,7 @@ def _objects(frame: int, boxes: Boxes, pose: Float64Array) -> list[ElementTree.E
         boxes.values.astype(np.float64)
     ):
         semantic = BY_NAME.get(boxes.names[i], BY_NAME["Misc"])
-        label, image_id, _ = OBJECTS[semantic]
+        label, image_id, _ = OBJECTS.get(semantic, ("unknownObject", 44, ""))
         c = np.cos(yaw)
         s = np.sin(yaw)
         local = np.eye(4)
