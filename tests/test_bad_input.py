@@ -242,6 +242,33 @@ def test_a_directory_without_scans(tmp_path: Path, layout: str) -> None:
         open_scans(tmp_path, layout=layout)
 
 
+@pytest.mark.parametrize(
+    ("layout", "part"),
+    [
+        ("semantic_kitti", ".."),
+        ("semantic_kitti", "sequences/00/velodyne"),
+        ("kitti_object", "training"),
+        ("kitti_object", "training/velodyne"),
+        ("kitti_raw", "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data"),
+        ("kitti360", ".."),
+    ],
+)
+def test_a_dataset_is_read_without_its_labels_on_request_alone(
+    layout: str, part: str, tmp_path: Path
+) -> None:
+    root = tmp_path / "above" / "dataset"
+    files = MAKERS[layout](root)
+    path = (root / part).resolve()
+    with pytest.raises(DataError, match=f"of layout '{layout}'.*Give {root}[. /]"):
+        open_scans(path)
+    assert len(open_scans(path, layout="folder")) == 3
+    shutil.copy(files[0], root)
+    (root / "mine").mkdir()
+    shutil.copy(files[0], root / "mine")
+    for own in (root / "mine", files[0]):
+        assert len(open_scans(own)) == 1
+
+
 def test_a_path_in_no_known_layout(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(

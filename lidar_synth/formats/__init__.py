@@ -160,7 +160,30 @@ def open_scans(
                 f"no {key}: layout {name!r} has none",
                 _AS_FOLDER if plain and Folder.recognises(Path(path)) else "",
             )
-    return reader(path, on_bad=on_bad, **options)  # type: ignore[arg-type]
+    scans = reader(path, on_bad=on_bad, **options)  # type: ignore[arg-type]
+    if layout is None and name == "folder":
+        _refuse_part(scans)
+    return scans
+
+
+def _refuse_part(scans: ScanFiles) -> None:
+    """Refuse a part of KITTI's datasets, or a folder above one, which as plain files would have
+    neither labels nor boxes.
+
+    Raises:
+        DataError: with the folder to give instead.
+    """
+    inner = next((name for name in scans.ids if "velodyne" in name), scans.ids[0])
+    scan = (scans.root / inner).absolute()
+    if scans.root.is_dir() and "velodyne" in str(scan.parts[-3:-1]):
+        for root in reversed(scan.parents[:5]):
+            for layout in ("kitti360", "semantic_kitti", "kitti_object", "kitti_raw"):
+                if READERS[layout].recognises(root):
+                    raise DataError(
+                        f"{scans.root} has scans of {root}, of layout {layout!r}",
+                        "the root of a dataset",
+                        f"Give {root}. {_AS_FOLDER}",
+                    )
 
 
 _AS_FOLDER = "--layout folder (layout='folder') reads its files as plain ones."

@@ -136,8 +136,8 @@ def plan_adaptation(
         )
     start = load_checkpoint(find_model(model))
     check_movable(start.header)
-    layout = reading.pop("layout", None) or layout_of(root)
-    source = open_scans(root, sensor=sensor, layout=layout, **reading)
+    layout = reading.get("layout") or layout_of(root)
+    source = open_scans(root, sensor=sensor, **reading)
     parts = split(source.ids)
     first = source[0]
     labelled = first.label is not None
