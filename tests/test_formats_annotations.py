@@ -159,6 +159,12 @@ def test_a_changed_label_is_written() -> None:
     raw = encode_labels(scan, SEMANTIC_KITTI)
     known = decode_labels(raw, SEMANTIC_KITTI, "here")
     assert same(known["label"], scan.label) and same(known["instance"], scan.instance)
+    raw[-2:] = 252 | 7 << 16, 60
+    scan = replace(scan, **decode_labels(raw, SEMANTIC_KITTI, "here"))
+    assert scan.label is not None
+    scan.label[0] = 8 - scan.label[0] % 2  # only this point's changes
+    assert same(encode_labels(scan, SEMANTIC_KITTI)[1:], raw[1:])
+    scan.label = scan.label % 3
     scan.instance = np.full(len(scan), 70_000, np.int32)
     with pytest.raises(DataError, match="instances from 70000 to 70000.*0..65535"):
         encode_labels(scan, SEMANTIC_KITTI)

@@ -5,6 +5,7 @@ bits are the dataset's class id, the upper 16 bits the instance. KITTI-360's lab
 packing with that dataset's class ids.
 """
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -74,28 +75,32 @@ def decode_labels(
 def encode_labels(scan: Scan, taxonomy: Taxonomy) -> NDArray[np.uint32]:
     """(N,) values to write for a scan's labels.
 
-    ``raw_label`` is written unchanged, bit for bit, if it decodes to ``label`` in this taxonomy.
-    Otherwise (ids of another dataset, a label that was changed since, or no ``raw_label``), the
-    values are the taxonomy's static class of ``label`` and ``instance`` in the upper bits. A scan
-    without labels gets 0 = unlabelled for every point.
+    The ``raw_label`` of a point is written unchanged, bit for bit, if it decodes to its ``label``
+    in this taxonomy. Otherwise (a label that was changed since, no ``raw_label``, or one that is of
+    another dataset, by any id), the value is the taxonomy's static class of ``label`` and
+    ``instance`` in the upper bits. A scan without labels gets 0 = unlabelled for every point.
 
     Raises:
         DataError: on a train id or an instance that the file cannot hold.
     """
-    raw = scan.raw_label
     label = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
-    if raw is not None and _means(raw, label, taxonomy):
-        return raw
-    classes = taxonomy.encode(label)
-    if scan.instance is None:
-        return classes
-    if len(scan) and not 0 <= scan.instance.min() <= scan.instance.max() <= 0xFFFF:
-        raise DataError(
-            f"scan {scan.id!r}: instances from {scan.instance.min()} to {scan.instance.max()}",
-            "0..65535, which is what a label file can hold",
-            "Number the instances of each scan anew before writing.",
-        )
-    return classes | (scan.instance.astype(np.uint32) << np.uint32(16))
+    raw = scan.raw_label
+    kept = np.zeros(len(scan), bool)
+    if raw is not None:
+        with suppress(DataError):
+            kept = taxonomy.decode((raw & 0xFFFF).astype(np.uint16)) == label
+        if kept.all():
+            return raw
+    values = taxonomy.encode(label)
+    if scan.instance is not None:
+        if len(scan) and not 0 <= scan.instance.min() <= scan.instance.max() <= 0xFFFF:
+            raise DataError(
+                f"scan {scan.id!r}: instances from {scan.instance.min()} to {scan.instance.max()}",
+                "0..65535, which is what a label file can hold",
+                "Number the instances of each scan anew before writing.",
+            )
+        values |= scan.instance.astype(np.uint32) << np.uint32(16)
+    return values if raw is None else np.where(kept, raw, values)
 
 
 def write_labels(path: Path, values: NDArray[np.uint32]) -> None:
@@ -105,12 +110,3 @@ def write_labels(path: Path, values: NDArray[np.uint32]) -> None:
         FileError: if it cannot be written.
     """
     write_file(path, values.astype("<u4").tobytes())
-
-
-def _means(
-    raw: NDArray[np.uint32], label: NDArray[np.uint8], taxonomy: Taxonomy
-) -> bool:
-    try:
-        return bool((taxonomy.decode((raw & 0xFFFF).astype(np.uint16)) == label).all())
-    except DataError:
-        return False
