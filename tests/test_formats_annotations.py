@@ -272,20 +272,23 @@ def test_kitti_object_lists_boxes_in_the_cameras_view(tmp_path: Path) -> None:
         (20, 0, -1, 4, 2, 1.5, 0),
         (-20, 0, -1, 4, 2, 1.5, 0),
         (20, 40, -1, 4, 2, 1.5, 0),
+        (1.5, 1, -1, 6, 2, 1.5, 0),
     ]
     scan = some_scan()
     scan.boxes = Boxes(
         np.array(values),
-        ("Car", "Car", "Van"),
+        ("Car", "Car", "Van", "Truck"),
         dont_care=np.array([(1, 2, 30, 40)], np.float32),
     )
     write_all("kitti_object", tmp_path, [scan], calibration=some_camera())
     read = KITTIObject(tmp_path, "train")[0].boxes
     assert (
         read is not None
-        and read.names == ("Car",)
+        and read.names == ("Car", "Truck")  # which the camera's plane cuts
         and same(read.dont_care, [(1, 2, 30, 40)])
+        and read.occlusion.tolist() == [0, 0]
     )
+    assert read.truncation[0] == 0 and 0.9 < read.truncation[1] <= 1
     np.testing.assert_allclose(read.values[0], values[0], atol=0.02)
     assert [scan.id for scan in KITTIObject(tmp_path, "trainval")] == [
         "training/000000"

@@ -19,6 +19,7 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.geometry import FARTHEST, Boxes, wrap_angle
 from lidar_synth.geometry.arrays import Float64Array
 
+_STEPS = np.linspace(0, 1, 33)[:, None, None, None]  # along a line
 _FIELDS = "15 fields: a name and 14 numbers"
 
 
@@ -55,7 +56,6 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
             f"{path}: line {line + 1} has the values {values[line].tolist()}",
             "finite numbers, a size above 0 and an occlusion of 0 to 3",
         )
-
     truncation, occlusion, alpha, image_box, size, floor, turn = np.split(
         values, [1, 2, 3, 7, 10, 13], axis=1
     )
@@ -69,6 +69,7 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
         alpha=alpha[keep, 0],
         dont_care=image_box[ignored],
     )
+
 
 def boxes_from_camera(
     floor: Float64Array,
@@ -119,7 +120,8 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     """The inverse of ``read_label_2`` with KITTI's two decimals; ``KITTIObjectWriter`` defines
     which boxes are listed.
 
-    An unknown alpha is computed: rotation_y minus the direction of the box from the *sensor*. (The
+    An unknown occlusion is written as none, since KITTI's protocol leaves out 3. An unknown alpha
+    is computed: rotation_y minus the direction of the box from the *sensor*. (The
     devkit says the camera, but KITTI's own files agree with the sensor, up to rounding.)
 
     Raises:
@@ -143,7 +145,7 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
             "names of one word, such as Person_sitting",
         )
     for i in listed:
-        occlusion = boxes.occlusion[i] if boxes.occlusion[i] >= 0 else 3
+        occlusion = max(boxes.occlusion[i], 0)
         row = (alpha[i], *image_box[i], *size[i], *floor[i], rotation_y[i])
         lines.append(
             f"{boxes.names[i]} {_two(truncation[i])} {occlusion} {' '.join(map(_two, row))}"
@@ -158,8 +160,9 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
 
 
 def in_image(boxes: Boxes, camera: Calibration) -> tuple[Float64Array, Float64Array]:
-    """(M, 4) image boxes and (M,) truncations; unknown ones are computed from the corners, and
-    stay below 0 outside of the view."""
+    """(M, 4) image boxes and (M,) truncations; unknown ones are computed from the corners and,
+    where the camera's plane cuts a box, the lines between them. They stay below 0 outside of the
+    view."""
     image_box = boxes.image_box.astype(np.float64)
     truncation = boxes.truncation.astype(np.float64)
     unknown = np.flatnonzero((boxes.image_box < 0).any(axis=1))
@@ -167,8 +170,11 @@ def in_image(boxes: Boxes, camera: Calibration) -> tuple[Float64Array, Float64Ar
         return image_box, truncation
     edge = np.array(camera.image_size, np.float64) - 1
     for i in unknown:
-        pixels, depth = camera.pixels(boxes[[i]].corners()[0])
-        if depth.min() <= 0:
+        corners = boxes[[i]].corners()[0]
+        lines = corners + _STEPS * (corners[:, None] - corners)
+        pixels, depth = camera.pixels(lines.reshape(-1, 3))
+        pixels = pixels[depth > 0]
+        if not len(pixels):
             continue
         low = pixels.min(axis=0)
         high = pixels.max(axis=0)

@@ -200,9 +200,9 @@ class KITTIObjectWriter(Writer):
     ImageSets.
 
     As in KITTI, ``label_2`` lists only boxes in the camera's view: those with a known
-    ``image_box``, and those whose corners are in the image, for which ``image_box`` and truncation
-    are computed. A scan without known boxes is refused for ``training``. Trainers read the image
-    size from ``image_2``, so a scan without an image gets a black one.
+    ``image_box``, and those that reach into the image, for which ``image_box`` and truncation are
+    computed. A scan without known boxes is refused for ``training``. Trainers read the image size
+    from ``image_2``, so a scan without an image gets a black one.
 
     An id ``training/FFFFFF`` or ``testing/FFFFFF`` is kept; all other scans go into ``part``,
     numbered by index.
