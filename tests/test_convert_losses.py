@@ -177,3 +177,14 @@ def test_boxes_outside_the_camera_are_counted_and_refused_on_request(
             strict=True,
             progress=False,
         )
+
+
+@pytest.mark.parametrize("to", ["semantic_kitti", "kitti360", "kitti_object", "npz"])
+def test_drives_that_become_one_are_named(to: str, tmp_path: Path) -> None:
+    for name in ("002/00", "011/00"):
+        WRITERS["npz"](tmp_path / "in").write(some_scan(), 0, name=name)
+    for kept in (0, 2):
+        writer = WRITERS[to](tmp_path / to)  # type: ignore[call-arg]
+        report = convert(open_scans(tmp_path / "in"), writer, progress=False)
+        joined = "the limits of drives: several become one" in report.left_out
+        assert report.kept == kept and joined == (to in ("semantic_kitti", "kitti360"))

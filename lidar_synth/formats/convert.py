@@ -157,11 +157,11 @@ def _write_missing(
     missing, report = _compare(source, writer, on_bad)
     if change is not None and change.moves:
         if type(writer).carry is not Writer.carry:
-            report.left_out = [
+            report.left_out += [
                 "files such as times.txt, which are copied only where the sensor stays in its place"
             ]
     elif isinstance(source, ScanFiles):
-        report.left_out = writer.carry(source)
+        report.left_out += writer.carry(source)
     with map_in_processes(work, missing, jobs, CHUNK) as results:
         for done in tqdm(
             results, total=len(missing), unit="scan", disable=not (progress and missing)
@@ -205,10 +205,12 @@ def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], 
     report = Report()
     missing = []
     taken: set[str] = set()
+    drives = set()
     for index in range(len(source)):
         name = name_of(source, index)
         try:
-            places = {os.path.normcase(writer.path(index, name))} | (
+            path = writer.path(index, name)
+            places = {os.path.normcase(path)} | (
                 {f"id {name}"} if name is not None else set()
             )
             if places & taken:
@@ -217,6 +219,7 @@ def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], 
                     "a name, and a file, that no earlier scan has",
                 )
             taken |= places
+            drives.add((path.parent, (name or "").rpartition("/")[0]))
         except DataError as error:
             if on_bad == "error":
                 raise
@@ -226,6 +229,8 @@ def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], 
             report.kept += 1
         else:
             missing.append(index)
+    if len(dict(drives)) < len(drives) and "pose" in writer.keeps:
+        report.left_out.append("the limits of drives: several become one")
     return missing, report
 
 
