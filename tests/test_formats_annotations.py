@@ -528,7 +528,7 @@ def test_positions_of_kitti_tracklets_are_centres_of_the_floor(tmp_path: Path) -
     np.testing.assert_allclose(
         third.values[0], (10, 1, -0.9, 0.9, 0.8, 1.2, 5 - 2 * np.pi), atol=1e-5
     )
-    assert (third.occlusion[0], third.truncation[0], third.instance[0]) == (1, 0, 0)
+    assert (third.occlusion[0], third.truncation[0], third.instance[0]) == (1, 0, 1)
 
 
 def test_versions_of_nuscenes_that_were_not_downloaded_do_not_matter(

@@ -166,7 +166,7 @@ def read_calibration(
 
 def read_tracklets(path: Path) -> dict[int, Boxes]:
     """{frame: boxes} of a drive, in the sensor frame; a box's instance is the tracklet's number in
-    the file.
+    the file, from 1.
 
     Truncation is known (0) only if the tracklet marks the object as completely in the image.
 
@@ -177,7 +177,7 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
     rows: dict[int, list[Any]] = defaultdict(list)
     with parsing(path, "KITTI's tracklet_labels.xml"):
         tracklets = ElementTree.fromstring(read_file(path)).findall("tracklets/item")
-        for instance, tracklet in enumerate(tracklets):
+        for instance, tracklet in enumerate(tracklets, 1):
             name = tracklet.findtext("objectType", "").translate(_IN_NAMES)
             height, width, length = (float(tracklet.findtext(tag, "")) for tag in "hwl")
             for k, pose in enumerate(tracklet.findall("poses/item")):

@@ -85,7 +85,7 @@ class ScanFiles(ABC):
         if not ids:
             raise DataError(
                 f"{root} holds no scan",
-                (self.__doc__ or "").splitlines()[0].rstrip("."),
+                " ".join(str(self.__doc__).split("\n\n")[0].split()).rstrip("."),
             )
         self.root = root
         self.ids = tuple(ids)
