@@ -25,8 +25,7 @@ CODEC_NETWORK = {
     "architecture": "vqvae",
     "arguments": {
         "latent_channels": 4,
-        "codes": 16,
-        "codebook": "ema",
+        "codes": 256,
         "width": 8,
         "multipliers": [1, 2],
         "strides": [[1, 2]],

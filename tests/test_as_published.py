@@ -141,7 +141,6 @@ CODEC = {
         "arguments": {
             "latent_channels": 8,  # embed_dim, z_channels
             "codes": 16384,
-            "codebook": "gradient",
             "width": 64,
             "multipliers": [1, 2, 2, 4],
             "strides": [[1, 2], [2, 2], [2, 2]],

@@ -1,5 +1,4 @@
-"""A codebook: vectors are quantised to the nearest code, and codes are trained to follow their
-vectors."""
+"""A codebook: vectors are quantised to the nearest code; a loss moves codes to their vectors."""
 
 import torch
 import torch.nn.functional as F
@@ -8,15 +7,8 @@ from torch import Tensor, nn
 from lidar_synth.generate.models.convolution import to_map, to_tokens
 from lidar_synth.generate.models.layers import PIECE
 
-CODEBOOKS = ("gradient", "ema")
-"""How codes are trained: by the gradient of the distance, or as exponential moving averages of
-their vectors."""
-
 DECAY = 0.99
-"""Decay of the moving averages, per batch."""
-
-# Average vectors per batch below which a code of an "ema" codebook is dead and is reset.
-_LEAST = 0.03
+"""Decay of running statistics, per batch."""
 
 
 class Codebook(nn.Module):
@@ -26,22 +18,13 @@ class Codebook(nn.Module):
     Args:
         count: number of codes; 0 = no quantisation.
         channels: K, channels of a code.
-        kind: one of ``CODEBOOKS``.
     """
 
-    counts: Tensor
-    sums: Tensor
-
-    def __init__(self, count: int, channels: int, kind: str) -> None:
+    def __init__(self, count: int, channels: int) -> None:
         super().__init__()
-        self.codes = nn.Parameter(
-            torch.empty(count, channels), requires_grad=kind == "gradient" and count > 0
-        )
+        self.codes = nn.Parameter(torch.empty(count, channels), requires_grad=count > 0)
         if count:
             nn.init.uniform_(self.codes, -1 / count, 1 / count)
-        moving = count if kind == "ema" else 0
-        self.register_buffer("counts", torch.zeros(moving))
-        self.register_buffer("sums", torch.zeros(moving, channels))
 
     def __len__(self) -> int:
         return len(self.codes)
@@ -68,35 +51,6 @@ class Codebook(nn.Module):
             return torch.cat(
                 [torch.addmm(half, piece, codes.T).argmax(1) for piece in pieces]
             )
-
-    @torch.no_grad()
-    def follow(self, z: Tensor, index: Tensor) -> None:
-        """Update the codes of an "ema" codebook by the maps (B, K, h, w) that ``index`` (B, h w)
-        assigns to them."""
-        if not len(self.counts):
-            return
-        tokens = to_tokens(z).flatten(0, 1).float()
-        index = index.flatten()
-        counts = torch.bincount(index, minlength=len(self)).to(tokens.dtype)
-        sums = torch.zeros_like(self.sums).index_add_(0, index, tokens)
-        if torch.distributed.is_available() and torch.distributed.is_initialized():
-            torch.distributed.all_reduce(counts)
-            torch.distributed.all_reduce(sums)
-        self.counts.lerp_(counts, 1 - DECAY)
-        self.sums.lerp_(sums, 1 - DECAY)
-        self._replace_dead(tokens)
-        self.codes.copy_(self.sums / self.counts[:, None])
-
-    def _replace_dead(self, tokens: Tensor) -> None:
-        """Give codes that are hardly used new sums and counts, from vectors (N, K) of a batch."""
-        dead = self.counts < _LEAST
-        # Evenly spaced vectors of the batch replace dead codes: a deterministic choice.
-        places = torch.linspace(
-            0, len(tokens) - 1, len(self), device=tokens.device
-        ).long()
-        # Without an index by ``dead``, whose number of entries a GPU would have to be asked for.
-        self.sums.copy_(torch.where(dead[:, None], tokens[places], self.sums))
-        self.counts.masked_fill_(dead, 1.0)
 
 
 @torch.no_grad()

@@ -21,7 +21,7 @@ class Losses:
 
     Args:
         commitment: of the distance between latents and their codes, as a loss of the encoder.
-        codebook: of the same distance, as a loss of a "gradient" codebook.
+        codebook: of the same distance, as a loss of the codes.
         geometric: of the distance between points.
         mask: of the decoder's mask.
         adversarial: of the discriminator's output.

@@ -376,8 +376,6 @@ def _statistics(part: NetworkSpec) -> dict[str, Tensor]:
     return {
         "shift": torch.zeros(size),
         "scale": torch.ones(size),
-        "codebook.counts": torch.zeros(0),
-        "codebook.sums": torch.zeros(0, size),
     }
 
 

@@ -53,7 +53,7 @@ MIDDLE = ("mid.block_1", "mid.attn_1", "mid.block_2")
 MOST_MODULES = 4_000
 """Maximum number of modules of a network; a configuration may ask for 10^9 blocks. LiDM's have
 about 1,000."""
-STATISTICS = ("shift", "scale", "codebook.counts", "codebook.sums")
+STATISTICS = ("shift", "scale")
 """Buffers that only our autoencoder has."""
 
 

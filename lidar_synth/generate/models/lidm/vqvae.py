@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.models.attention import Grid
-from lidar_synth.generate.models.codebook import CODEBOOKS, Codebook, follow
+from lidar_synth.generate.models.codebook import Codebook, follow
 from lidar_synth.generate.models.convolution import (
     GROUPS,
     Attention,
@@ -83,7 +83,6 @@ class VQVAE(Autoencoder):
         channels: C of the image.
         latent_channels: channels of the latent and of a code.
         codes: size of the codebook; 0 = no codebook, latents are bounded by tanh instead.
-        codebook: one of ``CODEBOOKS``.
         width: channels at the finest level.
         multipliers: channels per level in units of ``width``.
         strides: rows and columns by which the image shrinks between two levels.
@@ -108,7 +107,6 @@ class VQVAE(Autoencoder):
         channels: int = 1,
         latent_channels: int = 8,
         codes: int = 16384,
-        codebook: str = "gradient",
         width: int = 64,
         multipliers: Sequence[int] = (1, 2, 2, 4),
         strides: Sequence[Sequence[int]] = ((1, 2), (2, 2), (2, 2)),
@@ -125,15 +123,10 @@ class VQVAE(Autoencoder):
         self.channels = channels
         self.mask = mask
         steps = [pair(s) for s in strides]
-        if (
-            codebook not in CODEBOOKS
-            or len(multipliers) != len(steps) + 1
-            or any(s not in _STEPS for s in steps)
-        ):
+        if len(multipliers) != len(steps) + 1 or any(s not in _STEPS for s in steps):
             raise ConfigError(
-                f"codebook {codebook!r}, multipliers {tuple(multipliers)} and strides {steps}",
-                f"one of {', '.join(CODEBOOKS)}, one multiplier more than strides, strides of "
-                f"{tuple(_STEPS)}",
+                f"multipliers {tuple(multipliers)} and strides {steps}",
+                f"one multiplier more than strides, strides of {tuple(_STEPS)}",
             )
         if not set(attention_levels) <= set(range(len(multipliers))):
             raise ConfigError(
@@ -156,7 +149,7 @@ class VQVAE(Autoencoder):
         self.to_latent = nn.Conv2d(latent_channels, latent_channels, 1)
         self.from_latent = nn.Conv2d(latent_channels, latent_channels, 1)
         self.decoder = Decoder(cells * (channels + mask), latent_channels, *levels)
-        self.codebook = Codebook(codes, latent_channels, codebook)
+        self.codebook = Codebook(codes, latent_channels)
         # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise
         # needs.
         self.register_buffer("shift", torch.zeros(latent_channels))
@@ -187,15 +180,12 @@ class VQVAE(Autoencoder):
     def forward(self, x: Tensor) -> Reconstruction:
         """Encode and decode images (B, C, H, W).
 
-        In training mode, this updates the running statistics of the latents and the codes of an
-        "ema" codebook.
+        In training mode, this updates the running statistics of the latents.
         """
         z = self._encode(x)
         if self.training:
             follow(z.detach(), self.shift, self.scale)
-        quantised, index = self.codebook(z)
-        if self.training:
-            self.codebook.follow(z.detach(), index)
+        quantised, _ = self.codebook(z)
         through = z + (quantised - z).detach() if len(self.codebook) else z
         gap = (z - quantised.detach()).float().square().flatten(1).mean(1)
         return Reconstruction(
@@ -211,8 +201,7 @@ class VQVAE(Autoencoder):
 
             reconstruction   the metric per channel, with the weights; label bits by cross-entropy
             codebook         squared distance of latents to their codes: ``commitment`` moves the
-                             encoder, ``codebook`` a "gradient" codebook; an "ema" codebook follows
-                             by moving averages
+                             encoder, ``codebook`` the codes
             mask             distance of the mask, where there is one, to 1 = return and -1 = none
             geometric        squared distance of points, each the mean of four neighbours in a row,
                              in units of the maximum range: preserves the curves that beams trace
