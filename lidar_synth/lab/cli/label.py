@@ -53,12 +53,10 @@ def label(
     """
     import json
 
-    from lidar_synth.errors import ConfigError, suggest
+    from lidar_synth.errors import choose
     from lidar_synth.lab.kitti360.labels import label_scans, plan_labels
 
-    if dataset != "kitti360":
-        hint = suggest(dataset, ["kitti360"])
-        raise ConfigError(f"dataset {dataset!r}", "kitti360", hint)
+    choose("dataset", dataset, {"kitti360": None})
     if dry_run:
         plan = plan_labels(root, split)
         windows = len(plan.jobs)

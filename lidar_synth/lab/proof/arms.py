@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from lidar_synth.errors import ConfigError, suggest
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
 from lidar_synth.mixing.defaults import TOWN_OBJECTS, quarter_of
@@ -175,11 +175,8 @@ def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
     Raises:
         ConfigError: on an unknown arm, or a share that is not between 0 and 1.
     """
-    if unknown := [name for name in names if name not in ARMS]:
-        given = f"arm {', '.join(map(repr, unknown))}"
-        raise ConfigError(
-            given, f"some of {', '.join(ARMS)}", suggest(unknown[0], ARMS)
-        )
+    for name in names:
+        choose("arm", name, ARMS)
     if wrong := [ratio for ratio in ratios if not 0 < ratio < 1]:
         raise ConfigError(
             f"ratio {wrong[0]}",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
-from lidar_synth.errors import ConfigError, DataError, choose, suggest
+from lidar_synth.errors import DataError, choose
 
 Groups = Mapping[str, Sequence[str]]
 """{name: classes that count as one}; labels of other classes do not count."""
@@ -70,12 +70,8 @@ def groups_of(classes: str, only: Sequence[str] = ()) -> Groups:
         ConfigError: on an unknown name.
     """
     groups = choose("classes", classes, GROUPS)
-    if unknown := [name for name in only if name not in groups]:
-        raise ConfigError(
-            f"class {', '.join(map(repr, unknown))} of {classes}",
-            f"some of {', '.join(groups)}",
-            suggest(unknown[0], groups),
-        )
+    for name in only:
+        choose(f"class of {classes}", name, groups)
     return {
         name: members for name, members in groups.items() if not only or name in only
     }

@@ -138,7 +138,7 @@ def selection_settings(config: DistillConfig, header: Header) -> dict[str, Any]:
 
 
 def save_costs(path: Path, costs: TrajectoryCosts, settings: dict[str, Any]) -> None:
-    """Write costs, the selection that they give, and their settings, which stand there as JSON.
+    """Write costs and their settings, which stand there as JSON.
 
     Raises:
         FileError: where it cannot be written.
@@ -146,7 +146,7 @@ def save_costs(path: Path, costs: TrajectoryCosts, settings: dict[str, Any]) -> 
     text = json.dumps(settings, sort_keys=True)
     arrays = asdict(costs)
     seal = {"settings": text, "checksum": _checksum(text, arrays)}
-    write_arrays(path, asdict(costs.selection) | arrays | seal)
+    write_arrays(path, arrays | seal)
 
 
 def _checksum(settings: str, arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from lidar_synth.errors import ConfigError, suggest
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.geometry import Scan, Sensor, presets
 from lidar_synth.geometry.projection import locate, project, unproject
 from lidar_synth.lab.evaluate.measures import KINDS
@@ -234,9 +234,4 @@ def find_protocol(protocol: str | Protocol) -> Protocol:
     """
     if isinstance(protocol, Protocol):
         return protocol
-    if protocol not in PROTOCOLS:
-        hint = suggest(protocol, PROTOCOLS)
-        raise ConfigError(
-            f"protocol {protocol!r}", f"one of {', '.join(PROTOCOLS)}", hint
-        )
-    return PROTOCOLS[protocol]
+    return choose("protocol", protocol, PROTOCOLS)
