@@ -71,6 +71,10 @@ def test_all_scans_of_a_plan_and_its_pools_are_of_the_coarser_sensor(
         assert scan.sensor == plan.grid
         assert np.array_equal(scan.points, expected.points)
     assert plan.identity()["beams"] == 8 and "beams" not in whole.identity()
+    other = replace(
+        plan, sensor=replace(plan.sensor, range_max=50.0)
+    )  # of the same name
+    assert other.identity() != plan.identity()
     task = PoolTask("town", tmp_path, plan.sensor, plan.grid, 1)
     made = read_pool(make_pool(task))
     assert made[0].sensor.shape == (8, 64) and len(made[0]) > 100

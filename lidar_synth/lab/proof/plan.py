@@ -20,7 +20,7 @@ from lidar_synth.lab.proof.settings import ProofSettings
 Pair = tuple[str, int]
 """The place that is left out, and the seed."""
 
-FORMAT = "lidar-synth-proof/7"
+FORMAT = "lidar-synth-proof/8"
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class ProofPlan:
         return {
             "format": FORMAT,
             "scans": hash_of_names(self.names),
-            "sensor": self.sensor.name,
+            "sensor": self.sensor.to_dict(),
             "half": self.half,
             **{name: value for name, value in own.items() if name not in free},
             **({} if self.training is None else {"tested": sorted(self.places)}),
