@@ -277,9 +277,9 @@ def test_several_sets_of_scans_follow_each_other() -> None:
         ("recipe.weight_decay=-1", "weight_decay -1.0; expected at least 0"),
         ("recipe.warmup=-5", "warmup -5; expected at least 0"),
         ("recipe.ema_after=-1", "ema_after -1; expected at least 0"),
-        ("recipe.metric=l7", "one of squared_l2, pseudo_huber, l1"),
+        ("recipe.metric=l7", "one of 'squared_l2', 'pseudo_huber', 'l1'"),
         ("recipe=null", "recipe = None"),
-        ("normalisation=cubic", "normalisation 'cubic'; expected one of r2flow"),
+        ("normalisation=cubic", "normalisation 'cubic'; expected one of 'r2flow'"),
         ("channels=[range, colour]", "range and some of"),
         ("sensor=hdl99", "sensor 'hdl99'"),
         (

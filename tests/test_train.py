@@ -615,7 +615,8 @@ def test_moments_get_the_strides_of_their_weights(tmp_path: Path) -> None:
 
 def test_a_recipe_with_an_unknown_name_is_refused() -> None:
     with pytest.raises(
-        ConfigError, match="metric 'l7'; expected one of squared_l2, pseudo_huber, l1"
+        ConfigError,
+        match="metric 'l7'; expected one of 'squared_l2', 'pseudo_huber', 'l1'",
     ):
         Recipe(iterations=1, metric="l7")
     with pytest.raises(ConfigError, match="at least 1"):

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, choose
 
 
 def import_(
@@ -53,11 +53,10 @@ def import_(
     from lidar_synth.lab.importers import IMPORTERS
     from lidar_synth.lab.importers.check import check_model
 
-    if peer not in IMPORTERS:
-        raise ConfigError(f"--peer {peer}", f"one of {', '.join(IMPORTERS)}")
+    load = choose("--peer", peer, IMPORTERS)
     if condition is not None and not check:
         raise ConfigError(f"--condition {condition} without --check", "--check as well")
-    header, networks = IMPORTERS[peer](file)
+    header, networks = load(file)
     if check and VELOCITY not in networks:
         raise ConfigError(
             f"--check of {file}, an autoencoder",

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import DataError, choose
 from lidar_synth.geometry import Scan
 from lidar_synth.lab.evaluate.cache import Cached, weights_hash
 from lidar_synth.lab.evaluate.distances import frechet_distance, squared_mmd
@@ -108,11 +108,9 @@ def find_weights(extractor: str, folder: Path | None) -> Path | None:
     package = _package()
     if package is None:
         return None
-    if extractor not in package.EXTRACTORS:
-        raise ConfigError(
-            f"extractor {extractor!r}", f"one of {', '.join(package.EXTRACTORS)}"
-        )
-    found: Path | None = package.EXTRACTORS[extractor].found(folder)
+    found: Path | None = choose("extractor", extractor, package.EXTRACTORS).found(
+        folder
+    )
     return found
 
 

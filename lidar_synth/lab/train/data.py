@@ -185,22 +185,17 @@ class Batches:
         if about.blank is not None:
             nothing = about.blank.to(cond).expand_as(cond)
         if about.reduction:
-            less = self._reduced(cond, nothing, draws[:, 4] / about.reduction)
+            if about.blank is None:
+                u = draws[:, 4] / about.reduction
+                less = CONDITIONS[about.name].reduced(cond, u, about.views)
+            else:
+                less = nothing.clone()
+                kept = about.views // 2  # as ``one_view`` of pixels
+                less[:, kept] = cond[:, kept]
             cond = _where(draws[:, 4] < about.reduction, less, cond)
         if about.dropout:
             cond = _where(draws[:, 3] < about.dropout, nothing, cond)
         return cond
-
-    def _reduced(self, cond: Tensor, nothing: Tensor, u: Tensor) -> Tensor:
-        """Conditions (B, ...) that tell less."""
-        about = self.conditioning
-        assert about is not None
-        if about.blank is None:
-            return CONDITIONS[about.name].reduced(cond, u, about.views)
-        less = nothing.clone()
-        kept = about.views // 2  # as ``one_view`` of pixels
-        less[:, kept] = cond[:, kept]
-        return less
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from lidar_synth.errors import ConfigError, DataError, FileError, parsing
+from lidar_synth.errors import ConfigError, DataError, FileError, choose, parsing
 from lidar_synth.files.disk import write_file
 from lidar_synth.generate.checkpoint import weights_hash
 from lidar_synth.generate.flow.path import METRICS
@@ -106,10 +106,7 @@ class Recipe:
             ("optimizer", OPTIMIZERS),
             ("schedule", SCHEDULES),
         ):
-            if getattr(self, key) not in table:
-                raise ConfigError(
-                    f"{key} {getattr(self, key)!r}", f"one of {', '.join(table)}"
-                )
+            choose(key, getattr(self, key), table)
         if set(self.weights) - set(CHANNELS) or not all(
             weight > 0 for weight in self.weights.values()
         ):

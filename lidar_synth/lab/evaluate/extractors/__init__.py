@@ -8,7 +8,7 @@ To add an extractor, write a module with a function that loads it and add an ent
 from functools import partial
 from pathlib import Path
 
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, choose
 from lidar_synth.lab.evaluate.extractors import (
     bonnetal,
     liploc,
@@ -200,9 +200,7 @@ def load_extractor(
         DataError: on a damaged file, one that contains code, or weights of another architecture.
         LibraryError: if an optional library is missing.
     """
-    if name not in EXTRACTORS:
-        raise ConfigError(f"extractor {name!r}", f"one of {', '.join(EXTRACTORS)}")
-    spec = EXTRACTORS[name]
+    spec = choose("extractor", name, EXTRACTORS)
     path = path or spec.found()
     if path is None:
         raise ConfigError(

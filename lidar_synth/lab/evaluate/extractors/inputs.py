@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import choose
 from lidar_synth.geometry import Scan, Sensor, presets
 from lidar_synth.geometry.arrays import Float32Array
 from lidar_synth.geometry.projection import locate, project
@@ -144,6 +144,4 @@ def preparation(name: str) -> NetworkInputs:
     Raises:
         ConfigError: on an unknown name.
     """
-    if name not in PREPARATIONS:
-        raise ConfigError(f"preparation {name!r}", f"one of {', '.join(PREPARATIONS)}")
-    return PREPARATIONS[name]
+    return choose("preparation", name, PREPARATIONS)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool
 from torch.utils.data import ConcatDataset
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.formats import OnBad, open_scans
 from lidar_synth.generate.checkpoint import NetworkSpec
 from lidar_synth.generate.models import encoders_of, network_class
@@ -235,10 +235,8 @@ class ConditionSection(Section):
             ConfigError: on an encoder of something else.
         """
         encoders = encoders_of(self.kind)
-        if (encoder := self.encoder or encoders[0]) not in encoders:
-            raise ConfigError(
-                f"condition.encoder {encoder!r}", f"one of {', '.join(encoders)}"
-            )
+        encoder = self.encoder or encoders[0]
+        choose("condition.encoder", encoder, dict.fromkeys(encoders))
         sizes = {
             "resolution": list(resolution),
             "target": list(target),

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
 from lidar_synth.generate.models import build_network, limit_modules, network_class
 from lidar_synth.generate.models.network import Autoencoder, Encoder
@@ -75,12 +75,8 @@ class TrainConfig(Run):
         Raises:
             ConfigError: on an unknown channel or normalisation.
         """
-        if self.normalisation not in NORMALISATIONS:
-            raise ConfigError(
-                f"normalisation {self.normalisation!r}",
-                f"one of {', '.join(NORMALISATIONS)}",
-            )
-        return TensorFormat(self.channels, NORMALISATIONS[self.normalisation])
+        chosen = choose("normalisation", self.normalisation, NORMALISATIONS)
+        return TensorFormat(self.channels, chosen)
 
     def parts(
         self, state: tuple[int, int, int], resolution: tuple[int, int]
