@@ -557,6 +557,15 @@ def test_a_run_without_its_configuration_is_not_resumed(
         call("train", config, "--resume")
 
 
+def test_a_batch_that_cannot_be_divided_is_refused_before_scans_are_projected(
+    scans: Path, tmp_path: Path
+) -> None:
+    config = write_config(scans, tmp_path)
+    with pytest.raises(ConfigError, match="a multiple of 3, such as recipe.batch=6"):
+        call("train", config, "recipe.accumulate=3")
+    assert not (tmp_path / "run" / "cache").exists()
+
+
 def test_a_cache_of_other_scans_is_refused(
     scans: Path, teacher: Path, tmp_path: Path
 ) -> None:

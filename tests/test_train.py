@@ -347,9 +347,10 @@ def test_processes_and_micro_batches_share_the_positions_of_a_step(
 
 def test_a_batch_that_cannot_be_divided_is_refused() -> None:
     with pytest.raises(
-        ConfigError, match="batch 8 over 3 micro-batches and 1 processes"
+        ConfigError,
+        match=r"recipe.batch=8 with recipe.accumulate=3 in 2 processes; .*recipe.batch=12",
     ):
-        list(micro_batches(0, 8, 3))
+        list(micro_batches(0, 8, 3, 0, 2))
 
 
 # schedules

@@ -268,12 +268,13 @@ def micro_batches(
     Raises:
         ConfigError: if the batch cannot be divided.
     """
-    if batch % (accumulate * processes):
+    parts = accumulate * processes
+    size = batch // parts
+    if batch % parts:
         raise ConfigError(
-            f"batch {batch} over {accumulate} micro-batches and {processes} processes",
-            "a multiple",
+            f"recipe.batch={batch} with recipe.accumulate={accumulate} in {processes} processes",
+            f"a multiple of {parts}, such as recipe.batch={(size + 1) * parts}",
         )
-    size = batch // (accumulate * processes)
     for i in range(accumulate):
         start = step * batch + (i * processes + process) * size
         yield range(start, start + size)

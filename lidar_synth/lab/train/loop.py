@@ -111,8 +111,15 @@ def steps(
     training.network.train()
     every = steps_between_figures(accelerator.device)
     recent: list[Record] = []
-    made = _make_ahead(batches, _positions(training, accelerator), accelerator)
-    for step in range(training.step, recipe.iterations):
+    numbers = range(training.step, recipe.iterations)
+    place = (accelerator.process_index, accelerator.num_processes)
+    parts = (
+        part
+        for step in numbers
+        for part in micro_batches(step, recipe.batch, recipe.accumulate, *place)
+    )
+    made = _make_ahead(batches, parts, accelerator)
+    for step in numbers:
         rate = recipe.rate * schedule(step, recipe.warmup, recipe.iterations)
         total = torch.zeros((), device=accelerator.device)
         evaluations = 0
@@ -201,19 +208,6 @@ def _taken(batch: Batch) -> Batch:
         if values is not None and values.device.type == "cuda":
             values.record_stream(torch.cuda.current_stream(values.device))
     return batch
-
-
-def _positions(training: Training, accelerator: "Accelerator") -> Iterator[range]:
-    """The positions of this process from here on, micro-batch by micro-batch."""
-    recipe = training.recipe
-    for step in range(training.step, recipe.iterations):
-        yield from micro_batches(
-            step,
-            recipe.batch,
-            recipe.accumulate,
-            accelerator.process_index,
-            accelerator.num_processes,
-        )
 
 
 def _move(training: Training, rate: float, figures: Tensor) -> None:

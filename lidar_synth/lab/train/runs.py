@@ -32,7 +32,7 @@ from lidar_synth.files.lock import one_writer
 from lidar_synth.generate.checkpoint import save_checkpoint
 from lidar_synth.lab.train.autoencoder import AutoencoderStage
 from lidar_synth.lab.train.config import DistillConfig, Run, TrainConfig
-from lidar_synth.lab.train.data import Batches, InTurns
+from lidar_synth.lab.train.data import Batches, InTurns, micro_batches
 from lidar_synth.lab.train.decoder import DecoderStage
 from lidar_synth.lab.train.held_out import Watch
 from lidar_synth.lab.train.interrupts import first_signal
@@ -76,7 +76,8 @@ def run(
 
     Raises:
         ConfigError: if the folder holds a run and ``resume`` is not set, or holds a run with other
-            settings, or one whose best weights were removed; on minutes that are no time.
+            settings, or one whose best weights were removed; on minutes that are no time; on a
+            batch that cannot be divided.
         LibraryError: if Accelerate (extra ``train``) is not installed.
         DataError: if the loss becomes NaN or infinite; the last saved state is kept.
         KeyboardInterrupt: on SIGINT or SIGTERM, after the state was saved; at once on a second one.
@@ -93,6 +94,11 @@ def run(
     if state.exists():
         _check_resumable(config, resume)
     with _accelerator(config) as accelerator, _lock(config, accelerator):
+        ranks = Ranks(accelerator.process_index, accelerator.num_processes)
+        recipe = config.recipe
+        next(
+            micro_batches(0, recipe.batch, recipe.accumulate, *ranks)
+        )  # else refused late
         stage = open_stage(config, accelerator.device)
         training = Training(stage.network, config.recipe)
         if state.exists():
@@ -101,7 +107,6 @@ def run(
         if accelerator.is_main_process:  # after all checks
             values = yaml.safe_dump(config.model_dump(mode="json"))
             write_file(config.output / "config.yaml", values.encode())
-        ranks = Ranks(accelerator.process_index, accelerator.num_processes)
         data = stage.open_data(ranks=ranks)
         stage.prepare(data, accelerator, ranks)
         batches = _add_rehearsal(stage, data, ranks)
