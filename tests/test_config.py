@@ -202,6 +202,13 @@ def test_the_town_and_paths_become_sources(
         match=r"data.path '\$KITTI360_ROOT'; expected variables that are set",
     ):
         disk.data.open(load_sensor(disk.sensor))
+    more = load_config(
+        TrainConfig, TINY, ["data.more=[{path: $KITTI360_ROOT, licence: none}]"]
+    )
+    with pytest.raises(
+        ConfigError, match=r"'\$KITTI360_ROOT'.*NAME=FOLDER, or give data.more=\[\]"
+    ):
+        more.data.open(source.sensor)
     monkeypatch.setenv("KITTI360_ROOT", str(tmp_path / "nowhere"))
     with pytest.raises(DataError, match="nowhere"):
         disk.data.open(load_sensor(disk.sensor))

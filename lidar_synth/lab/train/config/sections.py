@@ -73,14 +73,15 @@ class Data(Section):
     seen: list[dict[str, Any]] | None = None
     more: "tuple[Data, ...]" = ()
 
-    def open(self, sensor: Sensor) -> Source:
-        """The scans.
+    def open(self, sensor: Sensor, instead: str = "data.path=FOLDER") -> Source:
+        """The scans; ``instead`` is what else the user can give.
 
         Raises:
             ConfigError: on a path with a variable that is not set, or what the source refuses.
         """
         if self.more:
-            sources: list[Any] = [one.open(sensor) for one in self.parts()]
+            sources: list[Any] = [self.parts()[0].open(sensor)]
+            sources += [one.open(sensor, "data.more=[]") for one in self.more]
             return ConcatDataset(sources)
         if self.town is not None:
             return Town(self.seed, sensor, self.town, self.interval, motion=self.motion)
@@ -89,7 +90,7 @@ class Data(Section):
             raise ConfigError(
                 f"data.path {self.path!r}",
                 "variables that are set",
-                "Or give data.path=FOLDER.",
+                f"Type export NAME=FOLDER, or give {instead}.",
             )
         return open_scans(path, **self.model_dump(include=READING | LATER))
 
