@@ -345,6 +345,9 @@ def test_a_grid_that_is_none_is_refused(grid: str) -> None:
     [
         (["strategy=uniform_piecewise"], "which is uniform.*in a recipe grid=null"),
         (["strategy=timestep_distillation"], "which is uniform.*in a recipe grid=null"),
+        (["strategy=reflow"], "which is uniform.*in a recipe grid=null"),
+        (["strategy=piecewise_reflow"], "which is uniform.*in a recipe grid=null"),
+        (["intervals=8"], r"9 descending times from 1 to 0.*grid=null"),
         (["grid=null", "also=[101]"], "101 steps of selection.candidates=100 times"),
         (["grid=null", "intervals=101"], "Give selection.candidates=101 or more"),
     ],
@@ -355,7 +358,8 @@ def test_a_student_that_could_not_be_trained_is_refused_at_once(
     recipe = CONFIGS / "kitti360_student.yaml"
     with pytest.raises(ConfigError, match=message):
         load_config(DistillConfig, recipe, changes)
-    load_config(DistillConfig, recipe, ["strategy=reflow", "selection.candidates=3"])
+    others = ["strategy=reflow", "grid=null", "selection.candidates=3"]
+    load_config(DistillConfig, recipe, others)
 
 
 def test_files_that_are_no_configuration_are_refused(tmp_path: Path) -> None:

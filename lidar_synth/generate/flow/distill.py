@@ -44,8 +44,7 @@ raise a ``ConfigError`` on a grid or a number of steps that they do not support:
 - y0: (B, ...) data; reflow and timestep distillation ignore it and use the teacher's data.
 - y1: (B, ...) noise.
 - u: (B,) uniform numbers in (0, 1) (``noise.uniform``) that select the time of training of each
-  sample. For ``reflow``, u is the time t itself, possibly after one of ``flow.TIMESTEPS`` (R2Flow:
-  ``u_shaped``).
+  sample. For ``reflow``, u is the time t itself (R2Flow's is ``path.u_shaped``).
 - grid: N + 1 descending times from 1 to 0, the student's time grid.
 - steps: Euler steps of the teacher in an interval; from noise to data, it takes N times as many.
 - cond: the condition, passed to the teacher.
@@ -216,9 +215,6 @@ STRATEGIES: dict[str, Strategy] = {
 }
 """Strategies by name."""
 
-UNIFORM = ("uniform_piecewise", "timestep_distillation")
-"""The strategies that need a uniform grid."""
-
 
 def interval_of(t: Tensor, grid: Sequence[float]) -> Tensor:
     """(B,) index of the interval (t_{i+1}, t_i] of a descending grid that contains t; 0 = the
@@ -275,7 +271,7 @@ def _straight(
 
 
 def check_uniform(grid: Sequence[float]) -> None:
-    """Check a time grid of a strategy of ``UNIFORM``.
+    """Check a time grid of a strategy that takes a uniform one.
 
     Raises:
         ConfigError: on a grid that is not uniform.

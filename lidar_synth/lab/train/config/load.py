@@ -13,7 +13,7 @@ from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.files.recipes import find_recipe, merge, read_recipe, validate
 from lidar_synth.generate.checkpoint import CODEC
 from lidar_synth.generate.codec import make_codec
-from lidar_synth.generate.flow.distill import UNIFORM, check_uniform
+from lidar_synth.generate.flow.distill import check_uniform
 from lidar_synth.generate.flow.solvers import read_grid
 from lidar_synth.generate.models import build_network
 from lidar_synth.geometry import load_sensor
@@ -126,8 +126,9 @@ def _check_distill(config: DistillConfig) -> None:
         raise ConfigError(
             f"grid {list(config.grid)}",
             f"{config.intervals + 1} descending times from 1 to 0",
+            "Or give no grid (grid=null).",
         )
-    if config.strategy in UNIFORM:
+    if config.strategy != "adaptive_piecewise":
         check_uniform(config.grid)
 
 
