@@ -220,3 +220,4 @@ def test_what_cannot_be_is_refused(
         ConfigError, match="no KITTI360_ROOT for latent; expected --data"
     ):
         TaskRun("latent", tmp_path).reference  # noqa: B018
+        f"pixel.reflow={released}": "stage 'reflow'; expected one of 'teacher', 'stud",

@@ -67,11 +67,10 @@ def reproduce(
         raise ConfigError(f"--weights {weights}", "a folder that exists")
     spec = find_table(table)
     scale = "tiny" if tiny else "tenth" if tenth else "full"
-    folder = out / scale / "estimate" if estimate else out / scale
-    given = report.given_weights(use or (), spec.tasks)
+    given = report.given_weights(use or (), spec)
     limit = 1.0 if estimate else None
     works = {
-        task: TaskRun(task, folder, scale, given[task], device, weights, limit)
+        task: TaskRun(task, out / scale, scale, given[task], device, weights, limit)
         for task in spec.tasks
     }
     find_data(data)

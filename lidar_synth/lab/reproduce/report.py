@@ -6,11 +6,10 @@ from pathlib import Path
 
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.checkpoint import read_header
-from lidar_synth.generate.flow.distill import STRATEGIES
 from lidar_synth.lab.evaluate import PROTOCOLS
 from lidar_synth.lab.evaluate.features import describe_missing
 from lidar_synth.lab.evaluate.published import read_published, show_table
-from lidar_synth.lab.reproduce.tables import PaperTable, read_tables
+from lidar_synth.lab.reproduce.tables import PaperTable
 from lidar_synth.lab.reproduce.work import TaskRun
 from lidar_synth.lab.train.config import DistillConfig, load_config
 from lidar_synth.lab.train.state import read_progress
@@ -105,23 +104,23 @@ def _hours(table: PaperTable, work: TaskRun) -> Iterator[tuple[str, float]]:
 
 
 def given_weights(
-    given: Sequence[str], tasks: Sequence[str]
+    given: Sequence[str], table: PaperTable
 ) -> dict[str, dict[str, Path]]:
     """{task: {stage: file}} of texts TASK.STAGE=FILE.
 
     Raises:
-        ConfigError: on another text, a stage that the task does not have, or a missing file.
+        ConfigError: on another text, a stage that the table does not need, or a missing file.
     """
-    found: dict[str, dict[str, Path]] = {task: {} for task in tasks}
+    found: dict[str, dict[str, Path]] = {task: {} for task in table.tasks}
     for text in given:
         place, _, path = text.partition("=")
         task, _, stage = place.partition(".")
         if task not in found or not stage:
             raise ConfigError(
-                f"--use {text!r}", f"TASK.STAGE=FILE with a task of {', '.join(tasks)}"
+                f"--use {text!r}", f"TASK.STAGE=FILE with a task of {', '.join(found)}"
             )
-        stages = {**read_tables().tasks[task].stages, **STRATEGIES}
-        choose("stage", stage, stages)
+        needed = _all_stages(table, TaskRun(task, Path()))
+        choose("stage", stage, dict.fromkeys(needed))
         found[task][stage] = file = Path(path)
         if not file.is_file():
             raise ConfigError(

@@ -3,6 +3,7 @@
 The folder holds::
 
     RECIPE/, RECIPE_STRATEGY/    runs
+    estimate/                    runs of an estimate
     cache/                       projected scans, which the runs of a task share
     imported/                    released weights that were given in place of a run
     samples/RECIPE-STEPS/        generated scans
@@ -80,6 +81,11 @@ class TaskRun:
 
     @property
     def count(self) -> int:
+    @property
+    def runs(self) -> Path:
+        """The folder of the runs."""
+        return self.folder / ("" if self.minutes is None else "estimate")
+
         """Number of generated scans."""
         return math.ceil(self.task.scans / SCALES[self.scale])
 
@@ -92,7 +98,7 @@ class TaskRun:
         """The checkpoint of a stage."""
         if stage not in self.given:
             name = self.run_name(stage)
-            return self.folder / name / f"{name}.safetensors"
+            return self.runs / name / f"{name}.safetensors"
         path = self.given[stage]
         if path.suffix not in PEERS:
             return path
@@ -118,10 +124,10 @@ class TaskRun:
         Raises:
             ConfigError, FileError: as ``load_config``.
         """
-        values: dict[str, Any] = {"output": str(self.folder / self.run_name(stage))}
-        if stage != "codec":
-            cache = self.folder / "cache" / self.run_name("teacher")
-            values["data"] = {"cache": str(cache)}
+        values: dict[str, Any] = {"output": str(self.runs / self.run_name(stage))}
+        first = stage if stage == "codec" else "teacher"
+        cache = self.folder / "cache" / self.run_name(first)
+        values["data"] = {"cache": str(cache)}
         if self.scale == "tiny":
             values = self._tiny(values, stage)
         recipe = self.task.stages.get(stage, self.task.stages["student"])
