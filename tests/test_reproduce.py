@@ -11,6 +11,7 @@ from releases import peer_weights, write_r2flow
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import open_scans
+from lidar_synth.generate import devices
 from lidar_synth.generate.checkpoint import (
     load_checkpoint,
     read_header,
@@ -18,6 +19,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.lab.evaluate import evaluate
 from lidar_synth.lab.evaluate.published import read_published
+from lidar_synth.lab.reproduce import report
 from lidar_synth.lab.reproduce import work as work_module
 from lidar_synth.lab.reproduce.tables import read_tables
 from lidar_synth.lab.reproduce.work import VARIABLES, TaskRun, find_data

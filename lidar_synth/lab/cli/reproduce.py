@@ -1,5 +1,6 @@
 """``lidar-synth reproduce``: a table of the LiDAR-Flow paper, from the data to the figures."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -41,7 +42,10 @@ def reproduce(
     weights: Annotated[
         Path | None, Option(help="folder with published weights of extractors")
     ] = None,
-    device: Annotated[str, Option(help="device of sampling: cpu | cuda")] = "cpu",
+    device: Annotated[
+        str | None,
+        Option(help="device of sampling: cpu | cuda; by default a GPU if there is one"),
+    ] = None,
 ) -> None:
     """Trains what a table needs (autoencoder, teacher, student on timesteps selected for it),
     generates, compares by the paper's protocol and prints the figures below the paper's.
@@ -53,20 +57,28 @@ def reproduce(
     Examples:
       lidar-synth reproduce table1 --tiny
       lidar-synth reproduce table1 --data DATASETS --estimate
-      lidar-synth reproduce table1 --data DATASETS --weights metrics --device cuda
+      lidar-synth reproduce table1 --data DATASETS --weights metrics
       lidar-synth reproduce table1 --data DATASETS --use pixel.teacher=r2flow-kitti360-1rf.pth
     """
     from lidar_synth.errors import ConfigError
     from lidar_synth.lab.reproduce import report
+    from lidar_synth.generate.devices import available_devices
     from lidar_synth.lab.reproduce.tables import find_table
     from lidar_synth.lab.reproduce.work import TaskRun, find_data, write_town
 
     if tenth and tiny:
+    if os.environ.get("WORLD_SIZE", "1") != "1":
+        raise ConfigError(
+            "reproduce in several processes",
+            "one",
+            "Train its stages with torchrun, then give them by --use TASK.STAGE=FILE.",
+        )
         raise BadParameter("give one of the two", param_hint="--tenth, --tiny")
     if weights is not None and not weights.is_dir():
         raise ConfigError(f"--weights {weights}", "a folder that exists")
     spec = find_table(table)
     scale = "tiny" if tiny else "tenth" if tenth else "full"
+    device = device or available_devices()[:2][-1]  # the first GPU
     given = report.given_weights(use or (), spec)
     limit = 1.0 if estimate else None
     works = {
