@@ -9,7 +9,7 @@ import pytest
 from latent_runs import call, one_thread  # noqa: F401 - a fixture
 from releases import peer_weights, write_r2flow
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.formats import open_scans
 from lidar_synth.generate import devices
 from lidar_synth.generate.checkpoint import (
@@ -21,8 +21,9 @@ from lidar_synth.lab.evaluate import evaluate
 from lidar_synth.lab.evaluate.published import read_published
 from lidar_synth.lab.reproduce import report
 from lidar_synth.lab.reproduce import work as work_module
+from lidar_synth.lab.reproduce.report import reproduce
 from lidar_synth.lab.reproduce.tables import read_tables
-from lidar_synth.lab.reproduce.work import VARIABLES, TaskRun, find_data
+from lidar_synth.lab.reproduce.work import VARIABLES, TaskRun, find_data, write_town
 from lidar_synth.lab.train.config import DistillConfig
 
 TABLES = read_tables()
@@ -182,6 +183,45 @@ def test_scales_shorten_the_runs(tmp_path: Path) -> None:
     assert given.stages("student") == ["student"]
 
 
+def test_what_later_tasks_need_is_asked_for_before_the_first_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    works = {
+        "pixel": TaskRun("pixel", tmp_path, "tiny"),
+        "camera": TaskRun("camera", tmp_path / "camera"),
+    }
+    write_town({"pixel": works["pixel"]})
+    monkeypatch.delenv("LIDAR_SYNTH_CLIP", raising=False)
+    with pytest.raises(FileError, match="and set LIDAR_SYNTH_CLIP to it"):
+        works["camera"].check(["teacher"])
+    monkeypatch.delenv("SEMANTICKITTI_ROOT")
+    with pytest.raises(ConfigError, match="data.path '.SEMANTICKITTI_ROOT'"):
+        list(reproduce("table4", TABLES.tables["table4"], works))
+    assert not works["pixel"].config("teacher").output.exists()
+
+
+def test_an_estimate_shares_the_projected_scans(tmp_path: Path) -> None:
+    for stage in ("codec", "teacher", "student"):
+        one, other = (
+            TaskRun("latent", tmp_path, minutes=minutes).config(stage)
+            for minutes in (None, 1.0)
+        )
+        assert one.data.cache == other.data.cache is not None
+        assert other.output.parent == one.output.parent / "estimate"
+
+
+def test_scans_are_sampled_on_a_gpu_if_there_is_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        devices, "available_devices", lambda: ["cpu", "cuda:0", "cuda:1"]
+    )
+    monkeypatch.setattr(report, "reproduce", lambda *given: [given[2]["pixel"].device])
+    command = ("reproduce", "table1", "--out", tmp_path)
+    assert call(*command) == "cuda:0\n"
+    assert call(*command, "--device", "cpu") == "cpu\n"
+
+
 def test_the_datasets_are_found_below_one_folder(tmp_path: Path) -> None:
     import os
 
@@ -209,6 +249,7 @@ def test_what_cannot_be_is_refused(
     for use, expected in {
         f"pixel.techer={released}": "stage 'techer'.* Did you mean 'teacher'",
         f"pixel.codec={released}": "stage 'codec'; expected one of 'teacher'",
+        f"pixel.reflow={released}": "stage 'reflow'; expected one of 'teacher', 'stud",
         f"pixel.teacher={released}s": "x.pths'; expected TASK.STAGE=FILE with a file",
         f"pixel={released}": "expected TASK.STAGE=FILE with a task of pixel",
         "pixel.teacher": "expected TASK.STAGE=FILE with a file that exists",
@@ -217,9 +258,14 @@ def test_what_cannot_be_is_refused(
             call("reproduce", "table1", "--tiny", "--use", use, "--out", tmp_path)
     with pytest.raises(ConfigError, match="--weights nowhere; expected a folder"):
         call("reproduce", "table1", "--tiny", "--weights", "nowhere")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(
+        ConfigError, match="in several processes; .*with torchrun, then"
+    ):
+        call("reproduce", "table1", "--tiny", "--out", tmp_path / "paper")
+    assert not (tmp_path / "paper").exists()
     monkeypatch.delenv("KITTI360_ROOT")
     with pytest.raises(
         ConfigError, match="no KITTI360_ROOT for latent; expected --data"
     ):
         TaskRun("latent", tmp_path).reference  # noqa: B018
-        f"pixel.reflow={released}": "stage 'reflow'; expected one of 'teacher', 'stud",

@@ -50,8 +50,9 @@ def reproduce(
     """Trains what a table needs (autoencoder, teacher, student on timesteps selected for it),
     generates, compares by the paper's protocol and prints the figures below the paper's.
 
-    Run it again to resume; tables share their runs. The tasks are pixel (table 1), latent (2),
-    camera (3) and semantic (5); table 4 compares strategies, table 6 times.
+    Run it again to resume; tables share their runs. Table 1 needs KITTI-360, the others
+    SemanticKITTI too; 3, 4 and 6 CLIP (LIDAR_SYNTH_CLIP). The tasks are pixel (table 1), latent
+    (2), camera (3) and semantic (5); table 4 compares strategies, table 6 times.
 
     \b
     Examples:
@@ -61,24 +62,24 @@ def reproduce(
       lidar-synth reproduce table1 --data DATASETS --use pixel.teacher=r2flow-kitti360-1rf.pth
     """
     from lidar_synth.errors import ConfigError
-    from lidar_synth.lab.reproduce import report
     from lidar_synth.generate.devices import available_devices
+    from lidar_synth.lab.reproduce import report
     from lidar_synth.lab.reproduce.tables import find_table
     from lidar_synth.lab.reproduce.work import TaskRun, find_data, write_town
 
-    if tenth and tiny:
     if os.environ.get("WORLD_SIZE", "1") != "1":
         raise ConfigError(
             "reproduce in several processes",
             "one",
             "Train its stages with torchrun, then give them by --use TASK.STAGE=FILE.",
         )
+    if tenth and tiny:
         raise BadParameter("give one of the two", param_hint="--tenth, --tiny")
     if weights is not None and not weights.is_dir():
         raise ConfigError(f"--weights {weights}", "a folder that exists")
     spec = find_table(table)
-    scale = "tiny" if tiny else "tenth" if tenth else "full"
     device = device or available_devices()[:2][-1]  # the first GPU
+    scale = "tiny" if tiny else "tenth" if tenth else "full"
     given = report.given_weights(use or (), spec)
     limit = 1.0 if estimate else None
     works = {

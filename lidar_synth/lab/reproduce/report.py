@@ -7,7 +7,7 @@ from pathlib import Path
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.lab.evaluate import PROTOCOLS
-from lidar_synth.lab.evaluate.features import describe_missing
+from lidar_synth.lab.evaluate.features import describe_missing, load_extractors
 from lidar_synth.lab.evaluate.published import read_published, show_table
 from lidar_synth.lab.reproduce.tables import PaperTable
 from lidar_synth.lab.reproduce.work import TaskRun
@@ -28,11 +28,19 @@ def reproduce(
         works: its tasks by name.
 
     Yields:
-        Of each task, the paper's rows with those measured here below, in Markdown.
+        Of each task, what has no weights of extractors; after the trainings, the paper's rows with
+        those measured here below, in Markdown.
 
     Raises:
         ConfigError, FileError, DataError: as the trainings, the importers and ``evaluate``.
     """
+    for work in works.values():
+        work.check(_all_stages(table, work))
+        if table.rows:
+            work.open_reference()
+            protocol = PROTOCOLS[work.task.protocol]
+            found = load_extractors(protocol, work.weights)
+            yield describe_missing(found.missing, protocol)
     for task, work in works.items():
         for stage in _all_stages(table, work):
             work.train(stage)

@@ -13,7 +13,7 @@ The folder holds::
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -28,6 +28,8 @@ from lidar_synth.files.recipes import merge
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import save_checkpoint
 from lidar_synth.generate.loading import load_generator
+from lidar_synth.generate.models.encoders.clip_views import find_clip
+from lidar_synth.geometry import Source, load_sensor
 from lidar_synth.lab.evaluate import Score, evaluate
 from lidar_synth.lab.importers import IMPORTERS
 from lidar_synth.lab.reproduce.tables import Task, read_tables
@@ -80,12 +82,12 @@ class TaskRun:
         return read_tables().tasks[self.name]
 
     @property
-    def count(self) -> int:
-    @property
     def runs(self) -> Path:
         """The folder of the runs."""
         return self.folder / ("" if self.minutes is None else "estimate")
 
+    @property
+    def count(self) -> int:
         """Number of generated scans."""
         return math.ceil(self.task.scans / SCALES[self.scale])
 
@@ -172,6 +174,19 @@ class TaskRun:
         assert isinstance(config, DistillConfig)
         return config.selection.trajectories * config.selection.candidates
 
+    def check(self, stages: Sequence[str]) -> None:
+        """Refuse, before the first training, a dataset or weights of CLIP that are not there.
+
+        Raises:
+            ConfigError, FileError, LibraryError: naming them.
+        """
+        for stage in stages:
+            config = self.config(stage)
+            config.data.open(load_sensor(str(SENSOR)))  # which only the town needs
+            condition = getattr(config, "condition", None)
+            if condition is not None and condition.encoder == "clip_views":
+                find_clip(self.device)
+
     def train(self, stage: str) -> None:
         """Run a stage, or what is left of it.
 
@@ -185,19 +200,26 @@ class TaskRun:
         else:
             check_done(config)
 
+    def condition_scans(self) -> Sequence[str | None]:
+        """Path, layout and split of the scans that are conditions; None where there are none."""
+        task = self.task
+        if not task.conditional:
+            return [None] * 3
+        return str(self.reference), task.layout, task.split
+
     def sample(self, stage: str, steps: int) -> Path:
         """Generate the scans of a row."""
         out = self.folder / "samples" / f"{self.run_name(stage)}-{steps}"
-        conditional = self.task.conditional
+        path, layout, split = self.condition_scans()
         sample(
             out,
             model=str(self.checkpoint(stage)),
             count=self.count,
             steps=steps,
             device=self.device,
-            condition=str(self.reference) if conditional else None,
-            condition_layout=self.task.layout if conditional else None,
-            condition_split=self.task.split if conditional else None,
+            condition=path,
+            condition_layout=layout,
+            condition_split=split,
         )
         return out
 
@@ -207,7 +229,7 @@ class TaskRun:
         task = self.task
         generated = open_scans(self.sample(stage, steps))
         return evaluate(
-            open_scans(self.reference, layout=task.layout, split=task.split),
+            self.open_reference(),
             generated,
             task.protocol,
             weights=self.weights,
@@ -220,15 +242,17 @@ class TaskRun:
     def seconds(self, stage: str, steps: int) -> float:
         """Seconds of one scan by itself, the mean of two after a first one."""
         generator = load_generator(self.checkpoint(stage), device=self.device)
-        path = str(self.reference) if self.task.conditional else None
-        layout = self.task.layout if path else None
-        split = self.task.split if path else None
-        given = conditions_for(generator, path, layout, split)
+        given = conditions_for(generator, *self.condition_scans())
         moments = []
         for i in range(3):
             generator.scans(0, [i], conditions(given, [i]), steps=steps)
             moments.append(time.perf_counter())
         return (moments[2] - moments[0]) / 2
+
+    def open_reference(self) -> Source:
+        """The scans that are compared with; raises as ``open_scans``, and as ``reference``."""
+        task = self.task
+        return open_scans(self.reference, layout=task.layout, split=task.split)
 
     @property
     def reference(self) -> Path:
