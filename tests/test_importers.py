@@ -186,7 +186,7 @@ def run_import(path: Path, out: Path, *options: str) -> Any:
 def test_the_command_refuses_unknown_peers(released: Path, tmp_path: Path) -> None:
     result = run_import(released, tmp_path / "out.safetensors", "--peer", "nobody")
     assert isinstance(result.exception, ConfigError)
-    assert "one of r2flow" in str(result.exception)
+    assert "one of 'r2flow'" in str(result.exception)
     assert not (tmp_path / "out.safetensors").exists()
 
 

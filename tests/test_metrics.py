@@ -368,7 +368,7 @@ def test_bad_input() -> None:
     good = scans(2, 0)
     with pytest.raises(
         ConfigError,
-        match="protocol 'jsd'; expected one of .*lidm, r2flow, r3dpa, spiral, town",
+        match="protocol 'jsd'; expected one of .*'lidm', 'r2flow', 'r3dpa', 'spiral', 'town'",
     ):
         evaluate(good, good, "jsd")
     with pytest.raises(DataError, match="no generated scans; expected at least one"):

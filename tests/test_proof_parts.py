@@ -455,7 +455,7 @@ BAD = {
     "an unknown class": (
         drives(),
         {"only": ("tram",)},
-        "class 'tram' of semantic_kitti",
+        "class of semantic_kitti 'tram'",
     ),
     "a class that is nowhere": (
         drives(),
@@ -470,7 +470,7 @@ BAD = {
     "an unknown arm": (
         drives(),
         {"arms": ("real", "magic")},
-        "arm 'magic'; expected some of real",
+        "arm 'magic'; expected one of 'real",
     ),
     "a share of everything": (drives(), {"ratios": (1.0,)}, "ratio 1.0"),
     "no labels": (scans_with(label=None, raw_label=None), {}, "without labels"),
