@@ -4,6 +4,8 @@ scans."""
 import json
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -46,6 +48,18 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture(scope="module")
 def generator() -> Generator:
     return load_generator("town")
+
+
+def test_models_load_without_the_compiler_of_torch() -> None:
+    """Its import takes longer than all else."""
+    code = """if True:
+        import sys
+        from lidar_synth.generate.loading import load_generator, shipped_models
+        for name in shipped_models():
+            load_generator(name)
+        assert not {"torch._dynamo", "sympy"} & sys.modules.keys()
+    """
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("columns", [2048, 1024])

@@ -59,13 +59,16 @@ class Rotary(Exact):
     def __init__(self, grid: Sequence[int], heads: int, width: int) -> None:
         super().__init__()
         highest = [math.log(max(size // 2, 1)) for size in grid]
-        spread = torch.stack(
-            [torch.linspace(0, h, heads * width // 4).exp().round() for h in highest]
-        )
+        # Not on "meta", where these functions import torch's compiler, which takes a second.
+        # ``as_tensor`` moves to the device on which networks are built.
+        spread = [
+            torch.linspace(0, h, heads * width // 4, device="cpu").exp().round()
+            for h in highest
+        ]
         # (2, heads, D / 4): neighbouring harmonics are assigned to different heads.
         self.register_buffer(
             "harmonics",
-            spread.reshape(2, width // 4, heads).transpose(1, 2).contiguous(),
+            torch.as_tensor(torch.stack(spread)).view(2, -1, heads).mT.contiguous(),
         )
 
     def forward(self, angles: Tensor) -> tuple[Tensor, Tensor]:
@@ -215,7 +218,9 @@ class TimeFeatures(Exact):
 
     def __init__(self, dim: int) -> None:
         super().__init__()
-        self.register_buffer("frequencies", torch.randn(dim // 2))
+        # Not ``randn``, for the same reason as in ``Rotary``.
+        drawn = torch.normal(0.0, 1.0, (dim // 2,))
+        self.register_buffer("frequencies", torch.as_tensor(drawn))
 
     def forward(self, t: Tensor) -> Tensor:
         """Times (B,) to (B, dim)."""

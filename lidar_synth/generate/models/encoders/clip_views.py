@@ -38,8 +38,8 @@ class ClipViewEncoder(Encoder):
         self.resolution = (CLIP_SIDE, CLIP_SIDE * views)
         self.channels = channels
         self.views = views
-        self.view_embedding = nn.Parameter(torch.empty(views, CLIP_WIDTH))
-        nn.init.normal_(self.view_embedding, std=CLIP_WIDTH**-0.5)
+        fresh = torch.normal(0.0, CLIP_WIDTH**-0.5, (views, CLIP_WIDTH))
+        self.view_embedding = nn.Parameter(torch.as_tensor(fresh))
         self.project = nn.Linear(CLIP_WIDTH, channels)
 
     def forward(self, cond: Tensor) -> Tensor:

@@ -144,7 +144,7 @@ class SurfaceAutoencoder(BoundedAutoencoder):
             start = self.head.bias.zero_()[: surfaces * (NUMBERS + codes)].view(
                 surfaces, -1
             )
-            start[:, 0] = torch.linspace(1.2, 4.0, surfaces + 2)[1:-1]
+            start[:, 0] = torch.linspace(1.2, 4.0, surfaces + 2, device="cpu")[1:-1]
             start[:, 3] = -3
             start[:, 6] = -1.5
         # As ``measure_noise`` finds them in scans.
