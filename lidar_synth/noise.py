@@ -11,18 +11,22 @@ depends only on its 64-bit key (the seed) and its 128-bit counter::
 A block is four 32-bit words. Element ``e`` of a scan (row-major) comes from word ``e mod 4`` of
 block ``e div 4``, so that a smaller shape is a prefix of a larger one. Each kind of random number
 has its own stream.
+
+torch is imported by what returns tensors: ``keyed_rng`` works without it.
 """
 
 import math
 from collections.abc import Sequence
-from typing import SupportsIndex
+from typing import TYPE_CHECKING, SupportsIndex
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lidar_synth.errors import ConfigError
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 _ROUNDS = 10
 _MULTIPLIERS = 0xD2511F53, 0xCD9E8D57
@@ -38,9 +42,9 @@ def gaussian(
     seed: int,
     indices: Sequence[int],
     shape: Sequence[int],
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float32,
-) -> Tensor:
+    device: "torch.device | str" = "cpu",
+    dtype: "torch.dtype | None" = None,
+) -> "Tensor":
     """Standard normal noise, one sample per index.
 
     The noise is computed in float64 by the Box-Muller transform and rounded once, so that devices
@@ -51,7 +55,7 @@ def gaussian(
         indices: B numbers, 0 <= index < 2^63, in any order.
         shape: shape of one sample, such as (C, H, W).
         device: the device of the result.
-        dtype: floating type of the result.
+        dtype: floating type of the result; None = float32.
 
     Returns:
         (B, *shape) noise; sample b depends on ``seed`` and ``indices[b]`` only.
@@ -68,19 +72,21 @@ def gaussian(
         >>> torch.equal(gaussian(seed=0, indices=[3], shape=(2, 64, 1024))[0], noise[1])
         True
     """
+    import torch
+
     words, count = _words(seed, indices, shape, device, _GAUSSIAN)
     radius = ((words[0::2].double() + 0.5) * 2.0**-32).log_().mul_(-2).sqrt_()
     angle = words[1::2].double() * (2 * math.pi * 2.0**-32)
     lanes = torch.stack([radius * angle.cos(), radius * angle.sin()], 1).flatten(0, 1)
-    return _samples(lanes.to(dtype), shape, count, device)
+    return _samples(lanes.to(dtype or torch.float32), shape, count, device)
 
 
 def uniform(
     seed: int,
     indices: Sequence[int],
     shape: Sequence[int] = (),
-    device: torch.device | str = "cpu",
-) -> Tensor:
+    device: "torch.device | str" = "cpu",
+) -> "Tensor":
     """Uniform float32 numbers in the open interval (0, 1), one sample per index.
 
     The values are odd multiples of 2^-24, exact in float32, so that every device gives the same
@@ -144,7 +150,7 @@ def key_words(seed: int, index: int, count: int) -> NDArray[np.uint64]:
     return keys
 
 
-def philox(counter: Tensor, seed: int) -> Tensor:
+def philox(counter: "Tensor", seed: int) -> "Tensor":
     """The counter-based generator Philox4x32-10.
 
     Args:
@@ -154,6 +160,8 @@ def philox(counter: Tensor, seed: int) -> Tensor:
     Returns:
         (4, ...) int64, random words 0 .. 2^32 - 1.
     """
+    import torch
+
     c0, c1, c2, c3 = counter.unbind()
     key0 = seed & _WORD
     key1 = seed >> 32
@@ -176,10 +184,12 @@ def _words(
     seed: int,
     indices: Sequence[int],
     shape: Sequence[int],
-    device: torch.device | str,
+    device: "torch.device | str",
     stream: int,
-) -> tuple[Tensor, int]:
+) -> "tuple[Tensor, int]":
     """(4, B, blocks) random 32-bit words, and the number of elements of one sample."""
+    import torch
+
     _check(seed, indices, shape)
     count = math.prod(shape)
     # CPU and CUDA have float64; for other devices the noise is computed on the CPU and copied.
@@ -208,7 +218,7 @@ def _check(seed: int, indices: Sequence[int], shape: Sequence[int]) -> None:
 
 
 def _samples(
-    lanes: Tensor, shape: Sequence[int], count: int, device: torch.device | str
-) -> Tensor:
+    lanes: "Tensor", shape: Sequence[int], count: int, device: "torch.device | str"
+) -> "Tensor":
     """Reshape words (4, B, blocks) to samples (B, *shape) on ``device``."""
     return lanes.movedim(0, -1).flatten(1)[:, :count].reshape(-1, *shape).to(device)
