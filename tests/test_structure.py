@@ -9,11 +9,14 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import pytest
+from banks import some_image, write_bank
 from mypy import api
 from project import PYPROJECT
 from sizes import size_of
 
 import lidar_synth
+from lidar_synth.bank import Bank
+from lidar_synth.lab import curate
 from lidar_synth.labels import POLICIES
 
 ORDER = """
@@ -291,6 +294,31 @@ def test_a_mixture_loads_few_modules_and_no_network() -> None:
 def test_banks_and_files_are_read_without_torch() -> None:
     code = "import sys, lidar_synth.bank, lidar_synth.formats; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+WITHOUT_TORCH = """
+town town --scans 1 --no-camera --layout semantic_kitti
+convert town npz --to npz
+verify bank
+bank merge merged bank
+bank head bank head --count 1
+curate bank
+"""
+"""Commands that run no network; torch takes longer to import than they take."""
+
+
+def test_commands_without_a_network_import_no_torch(tmp_path: Path) -> None:
+    write_bank(tmp_path / "bank", [some_image(seed) for seed in (0, 1)])
+    scores = curate.score(Bank(tmp_path / "bank"))
+    curate.write_scores(tmp_path / "bank" / curate.FILE, scores)
+    code = f"""if True:
+        import shlex, sys
+        from lidar_synth.cli import app
+        for line in {WITHOUT_TORCH.strip().splitlines()}:
+            app(shlex.split(line), standalone_mode=False)
+            assert "torch" not in sys.modules, line
+    """
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path)
 
 
 def repeated_classes(folder: Path) -> set[str]:

@@ -4,6 +4,8 @@ A scan is a function of (checkpoint, time grid, solver, seed, index). Its bytes 
 computation: precision, batch size, type of device, threads and versions. All of these are settings
 of the bank. Two runs with the same settings write the same bytes; a run with other settings is
 refused.
+
+Only ``make_plan`` imports torch: a bank is read, linked and checked without it.
 """
 
 import platform
@@ -16,21 +18,13 @@ from typing import Any
 import deflate
 import h5py
 import numpy as np
-import torch
 
-from lidar_synth.bake.conditions import conditions_for, fingerprint, settle_objects
 from lidar_synth.bake.options import BakeJob, default_shard_size
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.chunks import filters
 from lidar_synth.bank.encoding import TYPES
 from lidar_synth.bank.storage import bank_root, settle_path
 from lidar_synth.errors import ConfigError, choose
-from lidar_synth.generate.flow.solvers import SOLVERS
-from lidar_synth.generate.generator import BATCH
-from lidar_synth.generate.loading import load_generator, settle_model
-
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""Data types of the network's computation, by name."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +99,14 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
             hdf5plugin.
         FileError, DataError: if the checkpoint or the dataset of the conditions cannot be read.
     """
+    import torch
+
+    from lidar_synth.bake.conditions import conditions_for, fingerprint, settle_objects
+    from lidar_synth.generate.devices import DTYPES
+    from lidar_synth.generate.flow.solvers import SOLVERS
+    from lidar_synth.generate.generator import BATCH
+    from lidar_synth.generate.loading import load_generator, settle_model
+
     choose("solver", job.solver, SOLVERS)
     choose("dtype", job.dtype, DTYPES)
     filters(job.compression)

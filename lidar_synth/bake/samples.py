@@ -13,13 +13,13 @@ from lidar_synth.bake.conditions import (
     open_objects,
     settle_objects,
 )
-from lidar_synth.bake.job import DTYPES
 from lidar_synth.bake.options import Drawing
 from lidar_synth.bank.storage import settle_path
 from lidar_synth.datasets.recordings import NOTE, seen_by
 from lidar_synth.errors import choose
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.convert import Report
+from lidar_synth.generate.devices import DTYPES
 from lidar_synth.generate.generator import Generator, SamplingOptions
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry import Scan

@@ -18,12 +18,13 @@ from lidar_synth.bake.conditions import (
     open_objects,
 )
 from lidar_synth.bake.folder import at_work, find_finished, publish
-from lidar_synth.bake.job import DTYPES, BakePlan
+from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts, ShardWriter
 from lidar_synth.bank.folder import open_folder
 from lidar_synth.errors import ConfigError, FileError, LidarSynthError
 from lidar_synth.files.processes import usable_cores
+from lidar_synth.generate.devices import DTYPES
 from lidar_synth.generate.generator import BATCH, Generator
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry import RangeImage

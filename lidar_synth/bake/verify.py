@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.bake.remote import SHARD
-from lidar_synth.bake.shard import generate, load_checked, torch_threads
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.card import CARD, CROISSANT
 from lidar_synth.bank.folder import BankFolder, open_folder
@@ -168,6 +166,8 @@ def regenerate(
         ConfigError: if the checkpoint or the conditions are not those that made the scans.
         FileError, DataError: if the bank or the checkpoint cannot be read.
     """
+    from lidar_synth.bake.shard import generate, load_checked, torch_threads
+
     bank = Bank(root)
     chosen = sorted(
         np.random.default_rng(seed)
@@ -210,6 +210,8 @@ def job_of(
     Raises:
         DataError: if the facts hold no valid settings.
     """
+    import torch
+
     if facts.recorded:
         raise DataError(
             "recorded scans, which no model makes again", "a copy of the bank"

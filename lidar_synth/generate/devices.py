@@ -7,6 +7,9 @@ from torch.utils.data import get_worker_info
 
 from lidar_synth.errors import ConfigError
 
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+"""Data types of a network's computation, by name."""
+
 
 def available_devices() -> list[str]:
     """Names of the available devices: "cpu" first, then each GPU, then "mps" if a Mac has it."""

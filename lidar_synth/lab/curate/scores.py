@@ -28,7 +28,6 @@ from lidar_synth.geometry.projection import project
 from lidar_synth.lab.curate.duplicates import most_similar
 from lidar_synth.lab.curate.features import MEASURES, RANGE_BINS, features
 from lidar_synth.lab.curate.store import Store, measure
-from lidar_synth.lab.evaluate import jensen_shannon_distance
 
 FILE = "scores.npz"
 """Name of the file, in the bank's folder."""
@@ -209,6 +208,9 @@ def _of_source(source: Source, sensor: Sensor, number: int) -> Histograms:
 
 def _distances(store: Store, key: str, mean: Float64Array) -> Float64Array:
     """(N,) Jensen-Shannon distance of each scan's histogram to a mean histogram."""
+    # Here, as it imports torch: scores that exist are read without it.
+    from lidar_synth.lab.evaluate import jensen_shannon_distance
+
     known = mean.any()
     found = (
         jensen_shannon_distance(row, mean) if known and row.any() else FARTHEST
