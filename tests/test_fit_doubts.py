@@ -1,6 +1,7 @@
 """A fit names what it does not know: no beam or offset is wrong without a doubt."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 from functools import cache
 
@@ -9,6 +10,7 @@ import pytest
 from simulated_sweeps import BEAMS, turned
 
 from lidar_synth.geometry.assign import assign_beams
+from lidar_synth.geometry.lines import nearest_beams
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor, presets, sensor_yaml
 from lidar_synth.lab.fitting import SensorFit, fit_sensor
@@ -68,6 +70,25 @@ def test_a_sensor_with_unknown_offsets_is_written_read_and_cast(tmp_path) -> Non
     assert np.isfinite(azimuths).all()
     found = assign_beams(near_beam(), sensor)
     assert ((found.firing == -1) == (found.ring == 5)).all()
+
+
+def test_the_nearest_beam_is_found_without_an_array_of_all_pairs() -> None:
+    elevations, heights = load_sensor("hdl64e_lasers").optics()
+    tangents = np.tan(elevations)
+    points = np.random.default_rng(0).normal(0, [20, 20, 1], (20_000, 3))
+    points[0] = np.nan
+    near = points.astype(np.float32)
+    rho = np.hypot(near[:, :1], near[:, 1:2])
+    gap = near[:, 2:] - rho * tangents.astype(np.float32) - heights.astype(np.float32)
+    expected = np.abs(gap * (1 / np.hypot(1, tangents))).argmin(1)
+    assert not len(nearest_beams(points[:0], tangents, heights))  # compiles it
+    tracemalloc.start()
+    found = nearest_beams(points, tangents, heights)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (found == expected).all() and peak < 20_000 * 64
+    twins = nearest_beams(points, np.r_[tangents, tangents], np.r_[heights, heights])
+    assert (twins == expected).all()
 
 
 @pytest.mark.parametrize("few", [20, 60])

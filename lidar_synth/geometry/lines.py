@@ -4,12 +4,10 @@ A laser with elevation e at height h above the sensor's origin measures points w
 tan(e), where rho is the horizontal distance from the axis: a line per beam.
 """
 
+import numba
 import numpy as np
 
 from lidar_synth.geometry.arrays import Float64Array, Int64Array
-
-CHUNK = 1 << 15
-"""Number of points that are compared with all beams at a time."""
 
 
 def residuals(
@@ -37,17 +35,23 @@ def nearest_beams(
         return np.asarray(
             order[np.searchsorted((angles[1:] + angles[:-1]) / 2, elevation)]
         )
-    ring = np.empty(len(points), np.int64)
-    cosines = 1 / np.hypot(1, tangents)
-    for start in range(0, len(points), CHUNK):
-        part = points[start : start + CHUNK].astype(np.float32)
-        rho = np.hypot(part[:, 0], part[:, 1])
-        # The distance from the line; with the same point in each row, it orders beams as the angle
-        # does.
-        gap = (
-            part[:, 2:]
-            - rho[:, None] * tangents.astype(np.float32)
-            - heights.astype(np.float32)
-        ) * cosines
-        ring[start : start + CHUNK] = np.abs(gap).argmin(1)
+    ring = np.zeros(len(points), np.int64)
+    x, y, z = np.ascontiguousarray(points.T, np.float32)
+    slopes, starts = np.asarray([tangents, heights], np.float32)
+    _nearest(np.hypot(x, y), z, slopes, starts, 1 / np.hypot(1, tangents), ring)
     return ring
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _nearest(rho, z, tangents, heights, cosines, ring):  # type: ignore[no-untyped-def]
+    """Fill ``ring`` (N,), which holds zeros, with the first of the nearest beams of each point.
+
+    The distance from the line orders the beams of a point as the angle does.
+    """
+    for i in range(len(rho)):
+        nearest = np.inf
+        for k in range(len(tangents)):
+            gap = abs((z[i] - rho[i] * tangents[k] - heights[k]) * cosines[k])
+            if gap < nearest:
+                nearest = gap
+                ring[i] = k
