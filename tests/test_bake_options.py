@@ -37,6 +37,15 @@ def test_a_dry_run_needs_no_gpu_where_the_bake_needs_none(
         run(model, tmp_path, "--device cuda --dry-run")
 
 
+def test_unboxed_objects_are_counted_once(tmp_path: Path) -> None:
+    """Not again by a call that finds the bank finished."""
+    town = Path("town")
+    outputs = [run(town, tmp_path / "bank", "--count 1").output for _ in range(2)]
+    said = ["objects without a box a scan" in output for output in outputs]
+    assert said == [True, False]
+    assert all("1 scans in 1 shard, " in output for output in outputs)
+
+
 def test_a_dry_run_needs_what_the_engine_needs(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -152,7 +152,7 @@ def read_record(plan: BakePlan, number: int) -> Entry | None:
     with suppress(FileError, ValueError, TypeError):
         found.append(Entry(**json.loads(read_file(_note(plan.out, wanted)))))
     # afterwards: notes are removed when there is an index
-    if index := _index(plan.out):
+    if index := find_index(plan.out):
         found.append(index.by_file.get(wanted.file))
     return next(
         (e for e in found if e and replace(e, bytes=0, sha256="") == wanted), None
@@ -211,7 +211,7 @@ def finish(plan: BakePlan) -> Index | None:
         if len(entries) < len(plan.shards):
             return None
         index = Index((plan.facts,), tuple(entries))
-        there = _index(plan.out)
+        there = find_index(plan.out)
         if there is not None and there.shards == index.shards:
             index = there  # it may list repairs
         index = write_bank_files(plan.out, index, baked=True)
@@ -312,7 +312,7 @@ def _clear_up(root: Path, finished: bool) -> None:
             shutil.rmtree(root / folder, ignore_errors=True)
 
 
-def _index(root: str | Path) -> Index | None:
+def find_index(root: str | Path) -> Index | None:
     """The existing index, if it can be read; parsed again only after its file has changed."""
     if isinstance(root, str):
         with suppress(FileError, DataError):

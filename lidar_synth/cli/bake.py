@@ -171,7 +171,9 @@ def _run(
 ) -> None:
     """Bake, and print what there is now."""
     from lidar_synth.bake import bake
+    from lidar_synth.bake.folder import find_index
 
+    there = find_index(plan.out)
     first = os.environ.get("LOCAL_RANK", "0") == "0"
     try:
         index = bake(plan, engine, resources, share, progress=first)
@@ -191,7 +193,8 @@ def _run(
             f"{out}: {index.scans} scans in {_shards(len(index.shards))}, "
             f"{index.size / 1e6:.3g} MB"
         )
-        _report_unboxed(out)
+        if index != there:
+            _report_unboxed(out)
 
 
 def _report_unboxed(bank: str) -> None:
