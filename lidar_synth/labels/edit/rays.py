@@ -107,7 +107,7 @@ def rays_of_scan(scan: Scan) -> ScanRays:
     azimuth = -np.arctan2(y, x)
     rho = np.maximum(np.hypot(x, y), 1e-3)
     height = optics[np.minimum(ring, len(optics) - 1)]
-    order = np.lexsort((azimuth, ring))
+    order = np.argsort(8 * ring + azimuth, kind="stable")
     ring = ring[order]
     azimuth = azimuth[order]
     rho = rho[order]
