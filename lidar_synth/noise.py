@@ -75,7 +75,7 @@ def gaussian(
     import torch
 
     words, count = _words(seed, indices, shape, device, _GAUSSIAN)
-    radius = ((words[0::2].double() + 0.5) * 2.0**-32).log_().mul_(-2).sqrt_()
+    radius = ((words[::2].double() + 0.5) * 2.0**-32).log_().mul_(-2).sqrt_()
     angle = words[1::2].double() * (2 * math.pi * 2.0**-32)
     lanes = torch.stack([radius * angle.cos(), radius * angle.sin()], 1).flatten(0, 1)
     return _samples(lanes.to(dtype or torch.float32), shape, count, device)
@@ -146,7 +146,7 @@ def key_words(seed: int, index: int, count: int) -> NDArray[np.uint64]:
     """
     words, size = _words(seed, [index], (2 * count,), "cpu", _KEYS)
     halves = _samples(words, (size,), size, "cpu").numpy().astype(np.uint64)[0]
-    keys: NDArray[np.uint64] = halves[0::2] | halves[1::2] << np.uint64(32)
+    keys: NDArray[np.uint64] = halves[::2] | halves[1::2] << np.uint64(32)
     return keys
 
 
@@ -193,15 +193,14 @@ def _words(
     _check(seed, indices, shape)
     count = math.prod(shape)
     # CPU and CUDA have float64; for other devices the noise is computed on the CPU and copied.
-    place = torch.device(device)
-    if place.type != "cuda":
-        place = torch.device("cpu")
+    place = device if torch.device(device).type == "cuda" else "cpu"
     blocks = torch.arange(-(-count // 4), device=place)
     index = torch.tensor(list(indices), dtype=torch.int64, device=place)[:, None]
-    counter = (blocks, index & _WORD, index >> 32, blocks.new_tensor(stream))
-    return philox(
-        torch.stack([word.expand(len(index), len(blocks)) for word in counter]), seed
-    ), count
+    counter = [
+        word.expand(len(index), len(blocks))
+        for word in (blocks, index & _WORD, index >> 32, blocks.new_tensor(stream))
+    ]
+    return philox(torch.stack(counter), seed), count
 
 
 def _check(seed: int, indices: Sequence[int], shape: Sequence[int]) -> None:

@@ -17,7 +17,7 @@ from lidar_synth.bank.folder import BankFolder, open_folder
 from lidar_synth.bank.index import SETTINGS
 from lidar_synth.bank.reader import read_index
 from lidar_synth.bank.storage import bank_root
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.errors import DataError, FileError, parsing
 from lidar_synth.files.disk import sha256
 from lidar_synth.geometry import RangeImage
 
@@ -231,9 +231,5 @@ def job_of(
     }
     if not torch.cuda.is_available():
         stored["device"] = "cpu"
-    try:
+    with parsing(f"settings {facts.settings} of a bank", "the settings of a bake"):
         return BakeJob(**facts.settings | stored, model=model or facts.model)
-    except (ValueError, TypeError) as error:
-        raise DataError(
-            f"settings {facts.settings} of a bank", "the settings of a bake"
-        ) from error

@@ -363,7 +363,7 @@ def _objects_of_town(names: tuple[str, ...]) -> ObjectBank:
 
 def _collect_objects(real: Source | None, least: int) -> ObjectBank:
     try:
-        return ObjectBank.from_scans([] if real is None else real, least=least)
+        return ObjectBank.from_scans(real or [], least=least)
     except DataError as error:
         without = "labels='paste' without real scans to take objects from"
         raise ConfigError(

@@ -219,8 +219,9 @@ class TimeFeatures(Exact):
     def __init__(self, dim: int) -> None:
         super().__init__()
         # Not ``randn``, for the same reason as in ``Rotary``.
-        drawn = torch.normal(0.0, 1.0, (dim // 2,))
-        self.register_buffer("frequencies", torch.as_tensor(drawn))
+        self.register_buffer(
+            "frequencies", torch.as_tensor(torch.normal(0.0, 1.0, (dim // 2,)))
+        )
 
     def forward(self, t: Tensor) -> Tensor:
         """Times (B,) to (B, dim)."""

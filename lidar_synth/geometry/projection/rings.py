@@ -47,12 +47,9 @@ neighbouring ring."""
 def ring_bounds(points: Float32Array) -> NDArray[np.int64]:
     """(R + 1,) the first point of each ring, and N, for a scan of N points in raw ring order or a
     crop of one."""
-    starts = np.empty(0, np.int64)
     groups = _start_candidates(points)
-    if groups:
-        found = np.array([_best_candidate(group, points) for group in groups])
-        starts = _without_fragments(found, points)
-    return np.concatenate([[0], starts, [len(points)]]).astype(np.int64)
+    starts = [_best_candidate(group, points) for group in groups]
+    return _without_fragments(np.array([0, *starts, len(points)], np.int64), points)
 
 
 def fault_of(points: Float32Array, bounds: NDArray[np.int64], lasers: Sensor) -> str:
@@ -175,16 +172,15 @@ def _best_candidate(group: NDArray[np.intp], points: Float32Array) -> int:
 
 
 def _without_fragments(
-    starts: NDArray[np.intp], points: Float32Array
-) -> NDArray[np.intp]:
-    """The starts of rings without those that only cut a fragment off a ring."""
-    length = np.diff(np.concatenate([[0], starts, [len(points)]]))
+    bounds: NDArray[np.int64], points: Float32Array
+) -> NDArray[np.int64]:
+    """The bounds of rings without those that only cut a fragment off a ring."""
+    length = np.diff(bounds)
     short = np.flatnonzero(length < FRAGMENT * np.median(length))
     if not len(short):
-        return starts
-    middle = np.array(
-        [np.median(part) for part in np.split(_elevations(points), starts)]
-    )
+        return bounds
+    rings = np.split(_elevations(points), bounds[1:-1])
+    middle = np.array([*map(np.median, rings)])
     gap = float(np.median(np.abs(np.diff(middle))))
     removed = set()
     for i in short.tolist():
@@ -192,9 +188,7 @@ def _without_fragments(
         nearest = min(neighbours, key=lambda j: abs(middle[j] - middle[i]))
         if abs(middle[nearest] - middle[i]) < gap / 2:
             removed.add(max(i, nearest))
-    return np.array(
-        [start for i, start in enumerate(starts, 1) if i not in removed], np.intp
-    )
+    return np.delete(bounds, [*removed])
 
 
 def _height(points: Float32Array, bounds: NDArray[np.int64]) -> float:

@@ -5,7 +5,7 @@ counted, and removed with their holes filled.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numba
@@ -110,13 +110,10 @@ def measure(
     """
     total = Unboxed(0, 0, 0, 0)
     for scan in scans:
-        points = (
-            0 if scan.label is None else int(np.isin(scan.label, list(classes)).sum())
-        )
         counts = (
             1,
             int(clusters(scan, classes, least).max(initial=0)),
-            points,
+            int(_outside(replace(scan, boxes=None), classes).sum()),
             int(_outside(scan, classes).sum()),
         )
         total = Unboxed(*(a + b for a, b in zip(total, counts, strict=True)))

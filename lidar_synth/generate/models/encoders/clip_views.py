@@ -38,8 +38,9 @@ class ClipViewEncoder(Encoder):
         self.resolution = (CLIP_SIDE, CLIP_SIDE * views)
         self.channels = channels
         self.views = views
-        fresh = torch.normal(0.0, CLIP_WIDTH**-0.5, (views, CLIP_WIDTH))
-        self.view_embedding = nn.Parameter(torch.as_tensor(fresh))
+        self.view_embedding = nn.Parameter(
+            torch.as_tensor(torch.normal(0.0, CLIP_WIDTH**-0.5, (views, CLIP_WIDTH)))
+        )
         self.project = nn.Linear(CLIP_WIDTH, channels)
 
     def forward(self, cond: Tensor) -> Tensor:
