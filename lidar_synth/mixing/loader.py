@@ -25,7 +25,8 @@ class MixedLoader(DataLoader[Any]):
         batch_size: number of samples in a batch, on each rank.
         num_workers: number of worker processes.
         drop_last: whether to drop the samples that do not fill a batch on every rank.
-        options: further arguments of ``DataLoader``.
+        options: further arguments of ``DataLoader``. With ``persistent_workers=True`` the workers
+            stay, so that an epoch starts sooner; of the dataset's changes they see the epoch alone.
 
     Raises:
         ConfigError: on a batch size below 1, or another order of samples (``shuffle``, a sampler,
