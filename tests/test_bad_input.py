@@ -263,10 +263,11 @@ def test_a_dataset_is_read_without_its_labels_on_request_alone(
         open_scans(path)
     assert len(open_scans(path, layout="folder")) == 3
     shutil.copy(files[0], root)
-    (root / "mine").mkdir()
-    shutil.copy(files[0], root / "mine")
-    for own in (root / "mine", files[0]):
-        assert len(open_scans(own)) == 1
+    for name in ("mine", "velodyne_vlp16"):
+        (root / name).mkdir()
+        shutil.copy(files[0], root / name)
+        assert len(open_scans(root / name)) == 1
+    assert len(open_scans(files[0])) == 1
 
 
 def test_a_path_in_no_known_layout(tmp_path: Path) -> None:

@@ -178,7 +178,7 @@ def test_an_unknown_architecture_is_named_with_the_known_ones(
         )
     with pytest.raises(
         ConfigError,
-        match=r"condition.encoder 'views'; expected one of semantic_map, presence",
+        match=r"condition.encoder 'views'; expected one of 'semantic_map', 'presence'",
     ):
         call(
             "train",

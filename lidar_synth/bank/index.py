@@ -231,9 +231,12 @@ class Index:
         Raises:
             DataError: on another format or damaged content.
         """
-        with parsing(where, f"the index of a bank, {FORMAT}", REPAIR):
+        expected = f"the index of a bank, {FORMAT}"
+        with parsing(where, expected, REPAIR):
             values = bounded_json(text)
-            check_format(values.get("format"), where)
+            format_ = values.get("format")
+        check_format(format_, where)
+        with parsing(where, expected, REPAIR):
             given = values.pop("checksum", None)
             if given != json_checksum(values):
                 raise ValueError(

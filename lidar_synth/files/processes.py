@@ -22,7 +22,7 @@ GUARD = "In a script, put what starts processes below: if __name__ == '__main__'
 """What to type where a process ended before its work: it runs a script again from the top."""
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
-"""What a container may use of the CPUs: microseconds in each period of as many microseconds."""
+"""What a container may use of the CPUs: their time in each period, and the period, microseconds."""
 
 _work: Callable[[Any], Any] | None = None
 _busy = _stopped = False

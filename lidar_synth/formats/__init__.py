@@ -7,6 +7,7 @@ parametrised tests then include it.
 """
 
 import inspect
+import re
 from pathlib import Path
 from typing import Any
 
@@ -175,10 +176,11 @@ def _refuse_part(scans: ScanFiles) -> None:
     """
     inner = next((name for name in scans.ids if "velodyne" in name), scans.ids[0])
     scan = (scans.root / inner).absolute()
-    if scans.root.is_dir() and "velodyne" in str(scan.parts[-3:-1]):
+    if scans.root.is_dir():
         for root in reversed(scan.parents[:5]):
-            for layout in ("kitti360", "semantic_kitti", "kitti_object", "kitti_raw"):
-                if READERS[layout].recognises(root):
+            folder = scan.parent.relative_to(root).as_posix()
+            for layout, place in _PLACES.items():
+                if re.fullmatch(place, folder) and READERS[layout].recognises(root):
                     raise DataError(
                         f"{scans.root} has scans of {root}, of layout {layout!r}",
                         "the root of a dataset",
@@ -186,6 +188,13 @@ def _refuse_part(scans: ScanFiles) -> None:
                     )
 
 
+_PLACES = {
+    "kitti360": "data_3d_raw/[^/]+/velodyne_points/data",
+    "semantic_kitti": "sequences/[^/]+/velodyne",
+    "kitti_object": "(training|testing)/velodyne[^/]*",
+    "kitti_raw": "(.+/)?velodyne_points/data",
+}
+"""Where scans lie under the root of a dataset."""
 _AS_FOLDER = "--layout folder (layout='folder') reads its files as plain ones."
 
 

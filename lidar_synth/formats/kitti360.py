@@ -324,9 +324,11 @@ def _facts(scan: Scan) -> dict[str, Any]:
         pose = np.eye(4) if pose is None else pose
         boxes = boxes_as_lists(scan.boxes)
         if scan.label is not None and scan.instance is not None:
-            written = (label_values(scan) >> 16).tolist()
-            numbers = dict(zip(scan.instance.tolist(), written, strict=True))
-            boxes["instance"] = [numbers.get(n, n) for n in boxes["instance"]]
+            written = label_values(scan) >> 16
+            for i, number in enumerate(boxes["instance"]):
+                own = written[scan.instance == number]
+                if len(own):  # most of them: single points may have another label
+                    boxes["instance"][i] = int(np.bincount(own).argmax())
     return {"pose": pose, "boxes": boxes}
 
 

@@ -253,7 +253,6 @@ def _read_others(path: Path, frames: Container[int]) -> ElementTree.Element:
         root[:] = [
             node for node in root if int(node.findtext("timestamp") or -1) not in frames
         ]
-    # LookupError: an unknown encoding
     return root
 
 

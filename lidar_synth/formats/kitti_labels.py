@@ -120,9 +120,9 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     """The inverse of ``read_label_2`` with KITTI's two decimals; ``KITTIObjectWriter`` defines
     which boxes are listed.
 
-    An unknown occlusion is written as none, since KITTI's protocol leaves out 3. An unknown alpha
-    is computed: rotation_y minus the direction of the box from the *sensor*. (The
-    devkit says the camera, but KITTI's own files agree with the sensor, up to rounding.)
+    An unknown occlusion is written as 0, since KITTI's evaluation ignores objects of 3. An unknown
+    alpha is computed: rotation_y minus the direction of the box from the *sensor*. (The devkit says
+    the camera, but KITTI's own files agree with the sensor, up to rounding.)
 
     Raises:
         FileError: if it cannot be written.

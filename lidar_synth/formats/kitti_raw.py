@@ -205,7 +205,6 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
                         instance,
                     )
                 )
-    # LookupError: an unknown encoding
     boxes = {}
     for frame, found in sorted(rows.items()):
         values, names, occlusion, truncation, instances = zip(*found, strict=True)

@@ -85,7 +85,7 @@ class ScanFiles(ABC):
         if not ids:
             raise DataError(
                 f"{root} holds no scan",
-                " ".join(str(self.__doc__).split("\n\n")[0].split()).rstrip("."),
+                " ".join((self.__doc__ or "").split("\n\n")[0].split()).rstrip("."),
             )
         self.root = root
         self.ids = tuple(ids)

@@ -372,7 +372,6 @@ def _read(path: Path, tensors: bool = True) -> _Content:
         digest = _verified(values)
         weights = values.pop("weights", None)
         return _Content(Header.from_dict(values), digest, weights, stored)
-    # a ConfigError is a ValueError
 
 
 def _verified(values: dict[str, Any]) -> str:

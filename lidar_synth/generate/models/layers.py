@@ -153,3 +153,10 @@ class Mapping(nn.Module):
             x = x + layer(norm(x))
         out: Tensor = last(x)
         return out
+
+
+def normal(*shape: int, std: float = 1.0) -> Tensor:
+    """Normally distributed initial values. On "meta" there are none: torch would import its
+    compiler, which takes a second."""
+    values = torch.empty(shape)
+    return values if values.is_meta else values.normal_(std=std)

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidar_synth.generate.models.layers import Exact, Mapping
+from lidar_synth.generate.models.layers import Exact, Mapping, normal
 
 
 class RayAngles(Exact):
@@ -218,10 +218,7 @@ class TimeFeatures(Exact):
 
     def __init__(self, dim: int) -> None:
         super().__init__()
-        # Not ``randn``, for the same reason as in ``Rotary``.
-        self.register_buffer(
-            "frequencies", torch.as_tensor(torch.normal(0.0, 1.0, (dim // 2,)))
-        )
+        self.register_buffer("frequencies", normal(dim // 2))
 
     def forward(self, t: Tensor) -> Tensor:
         """Times (B,) to (B, dim)."""

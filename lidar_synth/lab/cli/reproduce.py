@@ -71,7 +71,8 @@ def reproduce(
         raise ConfigError(
             "reproduce in several processes",
             "one",
-            "Train its stages with torchrun, then give them by --use TASK.STAGE=FILE.",
+            "Train its stages with torchrun --nproc-per-node N, then give them: "
+            "--use TASK.STAGE=FILE.",
         )
     if tenth and tiny:
         raise BadParameter("give one of the two", param_hint="--tenth, --tiny")

@@ -39,8 +39,8 @@ def reproduce(
         if table.rows:
             work.open_reference()
             protocol = PROTOCOLS[work.task.protocol]
-            found = load_extractors(protocol, work.weights)
-            yield describe_missing(found.missing, protocol)
+            if missing := load_extractors(protocol, work.weights).missing:
+                yield describe_missing(missing, protocol)
     for task, work in works.items():
         for stage in _all_stages(table, work):
             work.train(stage)
@@ -85,6 +85,8 @@ def estimate(table: PaperTable, works: Mapping[str, TaskRun]) -> Iterator[str]:
         ConfigError, FileError, DataError: as ``reproduce``.
     """
     total = 0.0
+    for work in works.values():
+        work.check(_all_stages(table, work))
     for task, work in works.items():
         for what, hours in _hours(table, work):
             total += hours

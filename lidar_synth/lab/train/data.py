@@ -5,7 +5,7 @@ mirroring, noise, time) is a function of (seed, position) only, so that a resume
 another number of processes, sees the same data.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -256,7 +256,7 @@ def micro_batches(
     accumulate: int,
     process: int = 0,
     processes: int = 1,
-) -> Iterator[range]:
+) -> list[range]:
     """The positions that one process trains on in one optimiser step, one range per micro-batch.
 
     Args:
@@ -275,6 +275,6 @@ def micro_batches(
             f"recipe.batch={batch} with recipe.accumulate={accumulate} in {processes} processes",
             f"a multiple of {parts}, such as recipe.batch={(size + 1) * parts}",
         )
-    for i in range(accumulate):
-        start = step * batch + (i * processes + process) * size
-        yield range(start, start + size)
+    numbers = range(step * accumulate, (step + 1) * accumulate)
+    places = (number * processes + process for number in numbers)
+    return [range(place * size, (place + 1) * size) for place in places]

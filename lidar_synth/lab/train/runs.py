@@ -96,9 +96,8 @@ def run(
     with _accelerator(config) as accelerator, _lock(config, accelerator):
         ranks = Ranks(accelerator.process_index, accelerator.num_processes)
         recipe = config.recipe
-        next(
-            micro_batches(0, recipe.batch, recipe.accumulate, *ranks)
-        )  # else refused late
+        # A batch that cannot be divided is refused before scans are read.
+        micro_batches(0, recipe.batch, recipe.accumulate, *ranks)
         stage = open_stage(config, accelerator.device)
         training = Training(stage.network, config.recipe)
         if state.exists():
