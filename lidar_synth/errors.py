@@ -43,7 +43,6 @@ class LidarSynthError(Exception):
     """
 
     def __init__(self, given: str, expected: str = "", hint: str = "") -> None:
-        self.given = given
         # A single string in args, so that the exception can be pickled between worker processes.
         super().__init__(
             given
@@ -130,8 +129,7 @@ def needs(extra: str, what: str, otherwise: str = "") -> Iterator[None]:
 
 @contextmanager
 def parsing(what: object, expected: str = "", hint: str = "") -> Iterator[None]:
-    """Say what was read if its values are not as expected. An error of the package that says so
-    passes, unless there is a hint for it.
+    """Say what was read if its values are not as expected; errors that say so already pass.
 
     Args:
         what: the path, or a description.
@@ -144,11 +142,8 @@ def parsing(what: object, expected: str = "", hint: str = "") -> Iterator[None]:
     try:
         yield
     except MISFITS as error:
-        told = str(error.given if isinstance(error, LidarSynthError) else error)
-        named = str(what) in told
-        if isinstance(error, DataError) and named and not hint:
+        if isinstance(error, DataError) and str(what) in str(error):
             raise
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        raise DataError(
-            told if named else f"{what}: {kind}{told}", expected, hint
-        ) from error
+        cause = str(error).removesuffix(".")
+        raise DataError(f"{what}: {kind}{cause}", expected, hint) from error

@@ -260,7 +260,8 @@ def test_what_cannot_be_is_refused(
         call("reproduce", "table1", "--tiny", "--weights", "nowhere")
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(
-        ConfigError, match="in several processes; .*with torchrun, then"
+        ConfigError,
+        match="in several processes; .*with torchrun --nproc-per-node N, then",
     ):
         call("reproduce", "table1", "--tiny", "--out", tmp_path / "paper")
     assert not (tmp_path / "paper").exists()

@@ -208,9 +208,9 @@ def test_what_only_the_laboratory_imports_is_part_of_it() -> None:
 
 
 LIMITS = {
-    "plugin": (168_640, 5.91, 130),
-    "laboratory": (138_820, 6.01, 130),
-    "tools": (38_380, 5.8, 130),
+    "plugin": (168_440, 5.91, 130),
+    "laboratory": (138_790, 6.01, 130),
+    "tools": (38_370, 5.8, 130),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
 the code has become smaller."""

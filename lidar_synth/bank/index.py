@@ -231,12 +231,9 @@ class Index:
         Raises:
             DataError: on another format or damaged content.
         """
-        expected = f"the index of a bank, {FORMAT}"
-        with parsing(where, expected, REPAIR):
+        with parsing(where, f"the index of a bank, {FORMAT}", REPAIR):
             values = bounded_json(text)
-            format_ = values.get("format")
-        check_format(format_, where)
-        with parsing(where, expected, REPAIR):
+            check_format(values.get("format"), where)
             given = values.pop("checksum", None)
             if given != json_checksum(values):
                 raise ValueError(

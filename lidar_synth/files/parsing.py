@@ -77,13 +77,15 @@ RuntimeError."""
 ARRAYS = "arrays of numbers written by numpy, none of them pickled"
 
 
-def parse_json(text: str | bytes, where: str, expected: str = "JSON") -> Any:
+def parse_json(
+    text: str | bytes, where: str, expected: str = "JSON", hint: str = SKIP_HINT
+) -> Any:
     """Parse a JSON text.
 
     Raises:
         DataError: if it is not JSON, or nested too deeply.
     """
-    with parsing(f"{where} is not JSON", expected, SKIP_HINT):
+    with parsing(f"{where} is not JSON", expected, hint):
         return json.loads(text)
 
 

@@ -249,15 +249,13 @@ def _is_dataset(folder: Path) -> bool:
 
 def _current(path: Path) -> Description:
     expected = f"a description of scans, of this package or yours ({FORMAT})"
-    with parsing(
-        path,
-        expected,
-        "Restore it; or remove it (rename it, if it is another program's) and name the "
-        "sensor: --sensor (sensor=...).",
-    ):
-        return Description.from_dict(
-            parse_json(read_text(path, expected, LONGEST), str(path), expected)
-        )
+    hint = (
+        "Restore it; or remove it (rename it, if it is another program's) and name the sensor: "
+        "--sensor (sensor=...)."
+    )
+    with parsing(path, expected, hint):
+        text = read_text(path, expected, LONGEST)
+        return Description.from_dict(parse_json(text, str(path), expected, hint))
 
 
 def record(root: Path, sensor: Sensor, origin: Origin) -> Description:

@@ -336,8 +336,12 @@ def read_notes(
     for path in (
         list_files(folder / NOTES, ".json") if (folder / NOTES).is_dir() else []
     ):
-        with parsing(path, "a note of this package", f"Remove {path.parent}."):
-            notes[int(path.stem)] = parse_json(read_text(path), str(path))
+        expected = "a note of this package"
+        hint = f"Remove {path.parent}."
+        with parsing(path, expected, hint):
+            notes[int(path.stem)] = parse_json(
+                read_text(path), str(path), expected, hint
+            )
     known = {f: note["pose"] for f, note in notes.items() if note["pose"] is not None}
     return notes, {frame: np.array(pose) for frame, pose in known.items()}
 

@@ -261,10 +261,7 @@ class ObjectBank:
             DataError: if it is not a bank of objects, or damaged.
         """
         path = Path(path)
-        hint = (
-            "Copy it again, or make it again: ObjectBank.from_scans(source).save(path)."
-        )
-        with parsing(path, f"a bank of objects ({FORMAT})", hint):
+        with parsing(path, f"a bank of objects ({FORMAT})"):
             size = path.stat().st_size if path.is_file() else 0
             least, factor = MOST_PACKED
             most = min(least + factor * size, MOST_BYTES)
