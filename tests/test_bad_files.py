@@ -180,7 +180,7 @@ def test_damaged_text_files_are_named(
             "*.xml",
             "<instanceId>",
             "<instanceId>99999999999",
-            "out of bounds|too large",
+            "greater than maximum",
         ),
         ("kitti360", "*.xml", "<data>", "<data>nan ", "cannot reshape|no boxes"),
         ("kitti_object", "calib/000000.txt", "R0_rect: 1", "R0_rect: 2", "not rigid"),

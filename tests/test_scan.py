@@ -107,6 +107,9 @@ def test_mismatched_shapes_and_invalid_boxes_are_refused() -> None:
         Boxes(np.zeros((1, 7), np.float32), ("Car",))
     with pytest.raises(DataError, match=r"occlusion has shape \(2,\)"):
         Boxes(boxes(1).values, ("Car",), occlusion=np.zeros(2))
+    for track in (np.array([1 << 40]), [1 << 40], [0.5]):
+        with pytest.raises(DataError, match=f"instance {track[0]}; expected int32"):
+            Boxes(boxes(1).values, ("Car",), instance=track)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("taxonomy", TAXONOMIES, ids=lambda t: t.name)

@@ -18,6 +18,7 @@ has labels only.
 """
 
 import xml.etree.ElementTree as ElementTree
+from array import array
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,7 +178,7 @@ def read_boxes(path: Path) -> WorldBoxes:
         found = WorldBoxes(
             np.array(transforms).reshape(-1, 4, 4),
             np.array(names, np.str_),
-            np.array(instances, np.int32),
+            np.array(array("i", instances)),  # which refuses other numbers
             np.array(windows, np.int64).reshape(-1, 2),
             np.array(sorted(annotated), np.int64).reshape(-1, 2),
         )

@@ -98,11 +98,12 @@ class Boxes:
             ("alpha", (count,), np.float32, -10),
         ):
             given = getattr(self, name)
-            value = (
-                np.full(shape, unknown, dtype)
-                if given is None
-                else np.asarray(given, dtype)
-            )
+            if given is None:
+                given = np.full(shape, unknown)
+            given = np.asarray(given)
+            value = given.astype(dtype)
+            if dtype != np.float32 and not np.array_equal(value, given):
+                raise DataError(f"boxes: {name} {given.max()}", np.dtype(dtype).name)
             if count == 0 and value.size == 0:  # an empty list has no second axis
                 value = value.reshape(shape)
             if value.shape != shape:
