@@ -353,7 +353,7 @@ def test_what_does_not_fit_together(
         codec=str(pixel_checkpoint(tmp_path)),
     )
     refuse("unknown key 'condition.colour'", condition=SEMANTIC | {"colour": 1})
-    refuse("one of semantic_map", condition=SEMANTIC | {"encoder": "views"})
+    refuse("one of 'semantic_map'", condition=SEMANTIC | {"encoder": "views"})
     refuse(
         r"network.arguments with \['condition_channels'\]",
         condition=SEMANTIC,

@@ -155,7 +155,7 @@ class Mapping(nn.Module):
         return out
 
 
-def normal(*shape: int, std: float = 1.0) -> Tensor:
+def normal_values(*shape: int, std: float = 1.0) -> Tensor:
     """Normally distributed initial values. On "meta" there are none: torch would import its
     compiler, which takes a second."""
     values = torch.empty(shape)

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidar_synth.generate.models.layers import Exact, Mapping, normal
+from lidar_synth.generate.models.layers import Exact, Mapping, normal_values
 
 
 class RayAngles(Exact):
@@ -218,7 +218,7 @@ class TimeFeatures(Exact):
 
     def __init__(self, dim: int) -> None:
         super().__init__()
-        self.register_buffer("frequencies", normal(dim // 2))
+        self.register_buffer("frequencies", normal_values(dim // 2))
 
     def forward(self, t: Tensor) -> Tensor:
         """Times (B,) to (B, dim)."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from lidar_synth.errors import FileError, LibraryError
 from lidar_synth.generate.models.convolution import check_shape
 from lidar_synth.generate.models.encoders.camera_views import split_views
-from lidar_synth.generate.models.layers import normal
+from lidar_synth.generate.models.layers import normal_values
 from lidar_synth.generate.models.network import Encoder
 
 CLIP_VARIABLE = "LIDAR_SYNTH_CLIP"
@@ -39,7 +39,7 @@ class ClipViewEncoder(Encoder):
         self.resolution = (CLIP_SIDE, CLIP_SIDE * views)
         self.channels = channels
         self.views = views
-        start = normal(views, CLIP_WIDTH, std=CLIP_WIDTH**-0.5)
+        start = normal_values(views, CLIP_WIDTH, std=CLIP_WIDTH**-0.5)
         self.view_embedding = nn.Parameter(start)
         self.project = nn.Linear(CLIP_WIDTH, channels)
 
