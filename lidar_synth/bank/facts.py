@@ -114,7 +114,7 @@ class Facts:
             DataError: on another format, unknown keys, values of a wrong type, or a scale that does
                 not match the sensor.
         """
-        with parsing(where, f"those of {FORMAT}"):
+        with parsing(where, f"facts of {FORMAT}", REPAIR):
             values = dict(values)
             given = values.pop("format", None)
             check_format(given, where)
@@ -147,7 +147,7 @@ class Facts:
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any], where: str) -> "Facts":
         """The inverse of ``to_attributes``; raises as ``from_dict``."""
-        with parsing(where, f"those of {FORMAT}"):
+        with parsing(where, f"facts of {FORMAT}", REPAIR):
             check_format(_plain("format", attributes.get("format", b"")), where)
             values = {name: _plain(name, value) for name, value in attributes.items()}
         return cls.from_dict(values, where)
@@ -204,6 +204,7 @@ def _sensor(values: Any) -> Sensor:
 
 
 def check_format(given: Any, where: str) -> None:
+    """Raise ``DataError`` on another format than those of banks."""
     if given in (FORMAT, BOXED_FORMAT):
         return
     if str(given).startswith(FORMAT.rpartition("/")[0]):

@@ -310,7 +310,7 @@ def label_values(scan: Scan) -> NDArray[np.uint32]:
     ids = labels & 0xFFFF
     instances = labels >> 16
     local = (instances > 0) & (instances < MAX_INSTANCES)
-    if scan.raw_label is not None and scan.boxes is None:  # which have the old numbers
+    if scan.raw_label is not None and scan.boxes is None:  # boxes have the old numbers
         moving = local & (scan.raw_label & 0xFFFF >= MOVING)
         instances = np.where(moving, MAX_INSTANCES - instances, instances)
     return np.asarray(ids | (instances + local * ids * MAX_INSTANCES) << 16, np.uint32)

@@ -178,7 +178,7 @@ def read_boxes(path: Path) -> WorldBoxes:
         found = WorldBoxes(
             np.array(transforms).reshape(-1, 4, 4),
             np.array(names, np.str_),
-            np.array(array("i", instances)),  # which refuses other numbers
+            np.array(array("i", instances)),  # refuses what NumPy 1 would wrap
             np.array(windows, np.int64).reshape(-1, 2),
             np.array(sorted(annotated), np.int64).reshape(-1, 2),
         )

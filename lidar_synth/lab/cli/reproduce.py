@@ -79,7 +79,7 @@ def reproduce(
     if weights is not None and not weights.is_dir():
         raise ConfigError(f"--weights {weights}", "a folder that exists")
     spec = find_table(table)
-    device = device or available_devices()[:2][-1]  # the first GPU
+    device = device or [*available_devices()[1:], "cpu"][0]  # the first GPU
     scale = "tiny" if tiny else "tenth" if tenth else "full"
     given = report.given_weights(use or (), spec)
     limit = 1.0 if estimate else None
