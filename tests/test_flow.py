@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lidar_synth.errors import DataError
 from lidar_synth.generate.flow.guidance import autoguide
+from lidar_synth.generate.flow.moments import match_moments
 from lidar_synth.generate.flow.path import (
     METRICS,
     TIMESTEPS,
@@ -225,3 +226,13 @@ def test_per_sample_keeps_the_dtype_of_the_state() -> None:
     y = torch.zeros(3, 2, 4, 5, dtype=torch.float64)
     assert per_sample(torch.arange(3), y).shape == (3, 1, 1, 1)
     assert per_sample(torch.arange(3), y).dtype == torch.float64
+
+
+def test_matched_states_have_the_moments_of_the_others_in_each_row() -> None:
+    own, wanted = gaussian(0, range(40), (2, 3, 4)).chunk(2)
+    wanted = wanted * torch.tensor([1.0, 2.0, 3.0])[:, None] + torch.tensor(5.0)
+    scale, shift = match_moments(own, wanted)
+    assert scale.shape == shift.shape == (2, 3)
+    found = own * scale[..., None] + shift[..., None]
+    for moment in (torch.mean, torch.std):
+        assert torch.allclose(moment(found, (0, 3)), moment(wanted, (0, 3)), atol=1e-5)

@@ -151,6 +151,16 @@ def test_steps_and_solver_replace_the_checkpoints_own_grid(
             assert torch.allclose(
                 tensor, solve(generator.network, noise, grid, solver), atol=1e-5
             )
+    match = torch.rand(2, *noise.shape[1:3]).tolist()
+    header = replace(trained.header, matches={"2": match})
+    matched = replace(trained, header=Header.from_dict(header.to_dict()))
+    [tensor] = matched.samples(0, [0], steps=2)
+    [other] = matched.samples(0, [0], times=uniform_grid(2))
+    with torch.inference_mode():
+        state = solve(generator.network, noise, known)
+        assert torch.allclose(other, solve(generator.network, noise, uniform_grid(2)))
+    scale, shift = torch.tensor(match)[..., None]
+    assert torch.allclose(tensor, state * scale + shift, atol=1e-5)
     given = (1.0, 0.9, 0.4, 0.0)
     [tensor] = generator.samples(0, [0], times=given)
     with torch.inference_mode():

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from accelerate import Accelerator
 from flows import select_timesteps
 from test_run import call, distilling, one_thread, scans, teacher, write_config
@@ -45,6 +46,14 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(
         1,
     ]
     student = load_generator(tmp_path / "run" / "run.safetensors")
+    with torch.inference_mode():
+        moments = [
+            torch.std_mean(torch.cat([*student.samples(0, range(64), steps=n)]), (0, 3))
+            for n in (4, 2, 1)
+        ]
+    assert set(header.matches) == {"2", "1"}
+    for found in moments[1:]:
+        assert torch.allclose(torch.stack(found), torch.stack(moments[0]), atol=1e-4)
     # it was trained
     assert student.network.ends and student.network.step.out.weight.any()
     images = [
@@ -79,7 +88,8 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(
     )
     # It is not told where a step ends.
     flow = load_generator(tmp_path / "flow" / "flow.safetensors")
-    assert not flow.network.ends and flow.header.other_grids == ()
+    assert not flow.network.ends
+    assert flow.header.other_grids == () and flow.header.matches == {}
 
 
 def test_a_student_is_not_distilled_on_the_town_in_place_of_the_teachers_scans(

@@ -18,6 +18,8 @@ generation needs::
                     of the camera's images
     time_grid       times descending from 1 to 0: the steps that the weights were trained for
     other_grids     time grids for other numbers of steps, if there are any
+    matches         {number of steps: (2, C, rows) scale and shift of its states}, which gives them
+                    the moments of the states of ``time_grid``; see ``flow.moments``
     provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher,
                     recipe, metrics
     weights         sha256 of all tensors
@@ -29,7 +31,7 @@ checksum, which covers the header and, through ``weights``, the tensors. Nothing
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,6 +85,7 @@ class Header:
     provenance: dict[str, Any]
     conditioning: dict[str, Any] = field(default_factory=dict)
     other_grids: tuple[tuple[float, ...], ...] = ()
+    matches: dict[str, list[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not {VELOCITY, CODEC} & set(self.networks):
@@ -134,6 +137,15 @@ class Header:
             self.time_grid if steps is None else known.get(steps) or uniform_grid(steps)
         )
 
+    def match(self, state: Tensor, grid: Sequence[float]) -> Tensor:
+        """The result (B, C, rows, columns) of a time grid, with the moments of those of
+        ``time_grid``, where they were measured."""
+        steps = len(grid) - 1
+        if str(steps) not in self.matches or grid != self.grid(steps):
+            return state
+        scale, shift = state.new_tensor(self.matches[str(steps)])[..., None]
+        return state * scale + shift
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as the file stores them, without ``weights`` and ``checksum``."""
         values = {
@@ -148,11 +160,11 @@ class Header:
             "time_grid": list(self.time_grid),
             "provenance": self.provenance,
         }
-        return values | (
-            {"other_grids": [list(grid) for grid in self.other_grids]}
-            if self.other_grids
-            else {}
-        )
+        more = {
+            "other_grids": list(map(list, self.other_grids)),
+            "matches": self.matches,
+        }
+        return values | {key: value for key, value in more.items() if value}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Header":
@@ -183,6 +195,7 @@ class Header:
                 other_grids=tuple(
                     tuple(map(float, grid)) for grid in values.get("other_grids", ())
                 ),
+                matches=dict(values.get("matches", {})),
             )
         except KeyError as error:
             raise ConfigError(

@@ -340,6 +340,8 @@ class Generator:
                 values = None if conditions is None else conditions[part]
                 velocity, encoded = self._flow(values, guidance, grid)
                 state = solve(velocity, noise, grid, solver, encoded)
+                if guidance == 1:
+                    state = self.header.match(state, grid)
                 given = None if values is None else {str(self.condition): values}
                 tensors = codec.decode(state, draws, given)
             yield tensors

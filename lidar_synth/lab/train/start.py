@@ -228,7 +228,7 @@ def _drop_ends(networks: dict[str, nn.Module], header: Header) -> Opened:
     kept = {name: w for name, w in weights.items() if not name.startswith("step.")}
     velocity.load_state_dict(kept)
     parts = header.networks | {VELOCITY: part}
-    header = replace(header, networks=parts, other_grids=())
+    header = replace(header, networks=parts, other_grids=(), matches={})
     return networks | {VELOCITY: velocity}, header
 
 

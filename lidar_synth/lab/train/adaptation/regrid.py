@@ -113,7 +113,7 @@ def regrid(model: Checkpoint, sensor: Sensor) -> tuple[Header, dict[str, nn.Modu
         )
         if name == CODEC:
             state = make_codec(networks[CODEC], header.tensors, sensor.shape).shape[1:]
-    return replace(header, networks=parts, sensor=sensor), networks
+    return replace(header, networks=parts, sensor=sensor, matches={}), networks
 
 
 def check_movable(header: Header) -> None:
