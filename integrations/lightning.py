@@ -21,7 +21,6 @@ from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry import Source
 from lidar_synth.mixing import Collate, MixedBatches, MixedScans
-from lidar_synth.mixing.batches import CutSteps, cut_steps
 from lidar_synth.mixing.items import copy_scan
 from lidar_synth.mixing.service.batches import Places, complete
 from lidar_synth.mixing.state import after_epoch, check_state, make_state
@@ -228,7 +227,7 @@ class _Epochs:
     def __len__(self) -> int:
         """Number of batches in the complete epoch; Lightning adds the batches before a checkpoint
         to its count."""
-        return len(self._steps())
+        return len(self._batches.steps_from(0))
 
     def __iter__(self) -> Iterator[list[int]]:
         self._epoch = self._current()
@@ -238,7 +237,7 @@ class _Epochs:
     def state_dict(self) -> dict[str, Any]:
         """The state after the processed batches, and the number of samples in a step of all
         ranks."""
-        steps = self._steps()
+        steps = self._batches.steps_from(0)
         trainer = self._data.trainer
         done = 0
         last = len(steps)
@@ -262,7 +261,7 @@ class _Epochs:
         Raises:
             ConfigError: as ``MixedData.load_state_dict``.
         """
-        size = self._steps().size
+        size = self._batches.steps_from(0).size
         if state["position"] and state.get("step", size) != size:
             raise ConfigError(
                 f"a checkpoint from the middle of an epoch, {state['step']} samples a step, for "
@@ -281,9 +280,3 @@ class _Epochs:
         # The same batches again, where they are to be overfitted.
         passes: int = 0 if trainer.overfit_batches else trainer.current_epoch
         return max(self._least, self._data._first + passes)
-
-    def _steps(self) -> CutSteps:
-        batches = self._batches
-        return cut_steps(
-            0, len(batches.dataset), batches.batch_size, batches.world_size
-        )

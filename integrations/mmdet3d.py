@@ -31,7 +31,6 @@ from lidar_synth.integrations.mmdet3d_slots import (
     open_folder,
     read_url,
     scan_of,
-    split_url,
 )
 from lidar_synth.integrations.weights import KEY, weigh_mmdet3d
 from numpy.typing import NDArray
@@ -122,7 +121,7 @@ class SynthBoxes:
         info: dict[str, Any] = super().get_data_info(idx)  # type: ignore[misc]
         path = info["lidar_points"]["lidar_path"]
         if path.startswith(PREFIX):
-            scan = scan_of(*split_url(path)[:2])
+            scan = scan_of(path)
             info["ann_info"] = self._annotations(scan)
             if "plane" in info:
                 info["plane"] = ground_plane(scan)

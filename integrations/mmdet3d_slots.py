@@ -239,10 +239,10 @@ def read_url(url: str) -> bytes:
         FileError: if there is no such list.
     """
     source, number, kind = split_url(url)
-    scan = scan_of(source, number)
+    folder = open_folder(Path(source))
+    scan = folder.scan(number)
     if kind == "bin":
-        points = open_folder(Path(source)).layout.points(scan)
-        return points.astype("<f4").tobytes()
+        return folder.layout.points(scan).astype("<f4").tobytes()
     require_labels(scan)
     return encode_labels(scan, SEMANTIC_KITTI).astype("<u4").tobytes()
 
@@ -270,8 +270,9 @@ def is_mixed(folder: Path) -> bool:
     return (folder / MIXTURE).is_file()
 
 
-def scan_of(source: str, number: int) -> Scan:
+def scan_of(url: str) -> Scan:
     """The scan that a URL names."""
+    source, number, _ = split_url(url)
     return open_folder(Path(source)).scan(number)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.integrations.mmdet3d import Fetch
-from lidar_synth.integrations.mmdet3d_slots import PREFIX, scan_of, split_url
+from lidar_synth.integrations.mmdet3d_slots import PREFIX, scan_of
 from mmengine.hooks import Hook
 from mmengine.registry import HOOKS
 
@@ -21,11 +21,7 @@ def read_named(self: Fetch, indices: list[tuple[int, int]]) -> list[Any]:
     samples = read(self, indices)
     for sample in samples:
         path = str(sample["data_samples"].lidar_path)
-        name = (
-            scan_of(*split_url(path)[:2]).id
-            if path.startswith(PREFIX)
-            else Path(path).name
-        )
+        name = scan_of(path).id if path.startswith(PREFIX) else Path(path).name
         sample["data_samples"].set_metainfo({"scan": name})
     return samples
 
