@@ -11,7 +11,7 @@ from itertools import islice
 from typing import Any
 
 import pytest
-from mixtures import Endless, Scans
+from mixtures import Endless, Scans, Told
 from torch.utils.data import (
     ConcatDataset,
     DataLoader,
@@ -203,6 +203,14 @@ def test_a_mixture_as_the_real_source_follows_the_epoch(
             loader.dataset.set_epoch(epoch)
             seen = [sample for sample in samples(loader) if sample[0] != "t"]
             assert sorted(seen) == sorted(planned(inner, epoch))
+
+
+def test_real_sources_in_persistent_workers_hear_of_every_epoch() -> None:
+    train = MixedScans.wrap(Told(9), Endless(), 0.25, to_sample=name)
+    loader = train.loader(2, 2, collate_fn=list, persistent_workers=True)
+    for epoch in range(3):
+        real = [sample for sample in samples(loader) if sample[0] == "r"]
+        assert sorted(real) == [f"r{i} of epoch {epoch}" for i in range(9)]
 
 
 @pytest.mark.parametrize("endless", [False, True])

@@ -223,7 +223,7 @@ class MixedScans(Dataset[Any]):
             collate = Collate(collate, sensor, unlabelled)
         self.collate: Callable[[Any], Any] = collate
         self.current = CurrentEpoch()
-        self._planned: tuple[int, MixingPlan] | None = None
+        self._planned: MixingPlan | None = None
         # Whether this mixture continues an earlier one with the same plan; until set_epoch.
         self._continues = False
         self.set_epoch(0)
@@ -356,22 +356,22 @@ class MixedScans(Dataset[Any]):
         self.current.set(epoch)
         if get_worker_info() is None:
             self.tell_sources(epoch)
-            self.expect(epoch)
+            self.expect(epoch, range(len(self)))
 
     def tell_sources(self, epoch: int) -> None:
         """Set the epoch of the sources that have one, such as a ``RollingBank`` with ``refresh``
-        or a trainer's own dataset."""
-        for source in (*self.real, *self.synthetic):
-            if hasattr(source, "set_epoch"):
-                source.set_epoch(epoch)
+        or a trainer's own dataset; ``plan`` tells a worker's copies of real sources."""
+        _tell(
+            self.synthetic if get_worker_info() else self.real + self.synthetic, epoch
+        )
 
     def plan(self, epoch: int | None = None) -> MixingPlan:
-        """The plan of an epoch, by default the current one; the main process logs its hash once."""
+        """The plan of an epoch, by default the current one; the main process logs its hash once, a
+        worker sets the epoch of its real sources."""
         epoch = self.epoch if epoch is None else epoch
-        if self._planned is None or self._planned[0] != epoch:
-            self._planned = (epoch, MixingPlan(self.mixture, epoch))
+        if self._planned is None or self._planned.epoch != epoch:
+            self._planned = plan = MixingPlan(self.mixture, epoch)
             if get_worker_info() is None:
-                plan = self._planned[1]
                 log.info(
                     "epoch %d: %d samples, %d of them synthetic, plan %s",
                     epoch,
@@ -379,22 +379,22 @@ class MixedScans(Dataset[Any]):
                     plan.synthetics,
                     plan.hash[:16],
                 )
-        return self._planned[1]
+            else:
+                _tell([s for s in self.real if not isinstance(s, MixedScans)], epoch)
+        return self._planned
 
-    def expect(self, epoch: int, positions: Iterable[int] | None = None) -> None:
+    def expect(self, epoch: int, positions: Iterable[int]) -> None:
         """Announce the next positions to synthetic sources that work ahead.
 
         Args:
             epoch: the epoch of the positions.
-            positions: the positions in the order of their use, by default all; only the first
-                ``AHEAD`` are announced.
+            positions: the positions in the order of their use; only the first ``AHEAD`` are
+                announced.
         """
         if any(hasattr(source, "expect") for source in self.synthetic):
             plan = self.plan(epoch)
-            upcoming = islice(
-                range(len(plan)) if positions is None else positions, AHEAD
-            )
-            sources, indices = plan.at(np.fromiter(upcoming, np.int64))
+            upcoming = np.fromiter(islice(positions, AHEAD), np.int64)
+            sources, indices = plan.at(upcoming)
             for number, source in enumerate(self.synthetic, plan.reals):
                 if hasattr(source, "expect"):
                     source.expect(indices[sources == number].tolist())
@@ -489,7 +489,10 @@ class MixedScans(Dataset[Any]):
             return self.finish(
                 self.synthetic[source - plan.reals][index], epoch, position
             )
-        real = self.real[source][index]
+        scans = self.real[source]
+        if isinstance(scans, MixedScans):  # all workers share its epoch
+            index = Position(index, epoch)
+        real = scans[index]
         if self._real_as_is:
             return real
         rng = keyed_rng(self.seed, epoch, position)
@@ -554,6 +557,12 @@ class MixedScans(Dataset[Any]):
             (2, 0)
         """
         return MixedLoader(self, batch_size, num_workers, **options)
+
+
+def _tell(sources: Iterable[Any], epoch: int) -> None:
+    for source in sources:
+        if hasattr(source, "set_epoch"):
+            source.set_epoch(epoch)
 
 
 def _plan_synthetic(
