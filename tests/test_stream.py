@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mixtures import Endless, Scans
+from mixtures import Endless, Scans, Told
 from torch.utils.data import DataLoader
 
 import lidar_synth.mixing.stream as module
@@ -84,9 +84,56 @@ class Refreshed(Endless):
 def test_without_end_the_synthetic_source_hears_of_every_epoch() -> None:
     source = Refreshed()
     scans = MixedScans(Scans("r", 9), source, 0.4, to_sample=name)
-    list(islice(iter(MixedStream(scans)), 40))
+    list(islice(iter(MixedStream(scans, batch_size=4)), 40))
     assert source.told == [0, 1, 2]
     assert scans.epoch == 0  # that of the data set stays
+
+
+@pytest.mark.parametrize("workers", [0, 2, 3])
+@pytest.mark.parametrize("nested", [False, True])
+def test_without_end_real_sources_hear_of_every_epoch(
+    nested: bool, workers: int
+) -> None:
+    """In every worker; also those of a mixture in the mixture."""
+
+    def make() -> MixedScans:
+        real: Any = Told(9)
+        if nested:
+            real = MixedScans.wrap(real, Endless(name="t"), 0.5, to_sample=name)
+        return MixedScans.wrap(real, Endless(), 0.4, to_sample=name)
+
+    scans = make()
+    loader = load(MixedStream(scans, batch_size=4), workers)
+    seen = [sample for batch in islice(loader, 15) for sample in batch]
+    assert scans.epoch == 0
+    expected = []
+    scans = make()
+    for epoch in range(4):
+        scans.set_epoch(epoch)
+        expected += [scans[i] for i in range(len(scans))]
+    assert seen == expected[:60]
+
+
+@pytest.mark.parametrize("drop_last", [False, True])
+@pytest.mark.parametrize(("size", "ranks"), [(4, 1), (4, 2), (7, 2), (7, 4)])
+def test_the_length_is_that_of_a_ranks_share(
+    size: int, ranks: int, drop_last: bool
+) -> None:
+    for rank in range(ranks):
+        stream = MixedStream(
+            mixed(),
+            batch_size=size,
+            endless=False,
+            drop_last=drop_last,
+            rank=rank,
+            world_size=ranks,
+        )
+        loader = load(stream, 2 if size < 7 else 0)
+        batches = list(loader)
+        assert len(stream) == sum(map(len, batches))
+        assert len(loader) == len(batches)
+    with pytest.raises(TypeError, match="endless=False"):
+        len(load(MixedStream(mixed(), batch_size=size), 0))
 
 
 @pytest.mark.parametrize("endless", [False, True])

@@ -1,8 +1,9 @@
 """``MixedStream``: the same plan as an ``IterableDataset``, epoch by epoch or endlessly."""
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from itertools import chain, count, islice, takewhile
+import sys
+from collections.abc import Iterator, Mapping
+from itertools import chain, islice, takewhile
 from typing import Any
 
 from torch.utils.data import IterableDataset, get_worker_info
@@ -72,7 +73,7 @@ class MixedStream(Divided, IterableDataset[Any]):
         self,
         scans: MixedScans,
         *,
-        batch_size: int = 1,
+        batch_size: int,
         endless: bool = True,
         drop_last: bool = False,
         rank: int | None = None,
@@ -99,6 +100,22 @@ class MixedStream(Divided, IterableDataset[Any]):
         place = f"batches of {self.batch_size}, rank {self.rank} of {self.world_size}"
         mixture = repr(self.scans).partition("\n")[0]
         return f"{type(self).__name__}: {place}, {kind}\n  {mixture}"
+
+    def __len__(self) -> int:
+        """Number of samples of this rank in a complete epoch.
+
+        Raises:
+            TypeError: if the stream is endless.
+        """
+        if self.endless:
+            raise TypeError(
+                "an endless MixedStream has no length; with endless=False it has one"
+            )
+        steps = self._steps(0)
+        full, rest = divmod(steps.end, steps.size)
+        return full * self.batch_size + len(
+            rank_share(range(rest), self.rank, self.world_size)
+        )
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch in which iterating begins."""
@@ -132,10 +149,9 @@ class MixedStream(Divided, IterableDataset[Any]):
         """
         place = self._place()
         worker = place["worker"]
-        batches = islice(self._batches(begin, position), worker, None, place["workers"])
-        # Samples are numbered from where the pass began.
+        batches = islice(self._batches(position), worker, None, place["workers"])
         epoch = begin
-        first = -position  # number of the epoch's first sample
+        first = 0  # of the positions that count on, that of the epoch's first sample
         announced = 0
         for number in islice(chain.from_iterable(batches), self._yielded, None):
             if guarded:
@@ -147,7 +163,8 @@ class MixedStream(Divided, IterableDataset[Any]):
                 if worker == 0:
                     self.scans.tell_sources(epoch)
             if worker == 0 and number >= announced:
-                ahead = chain.from_iterable(self._batches(begin, position, number))
+                done = (number - position) // (self.batch_size * self.world_size)
+                ahead = chain.from_iterable(self._batches(position, done))
                 self.scans.expect(
                     epoch,
                     (n - first for n in takewhile(end.__gt__, ahead) if n >= number),
@@ -171,9 +188,7 @@ class MixedStream(Divided, IterableDataset[Any]):
         if done is not None:
             return make_state(self.scans.mixture, *self._after(epoch, position, done))
         done, part = divmod(given, self.batch_size)
-        batch = next(
-            self._batches(epoch, position, done * self.batch_size * self.world_size), ()
-        )
+        batch = next(self._batches(position, done), ())
         if get_worker_info() is not None or part not in (0, len(batch)):
             return (
                 make_state(self.scans.mixture, epoch, position)
@@ -241,17 +256,14 @@ class MixedStream(Divided, IterableDataset[Any]):
             "batch": self.batch_size,
         }
 
-    def _batches(self, epoch: int, position: int, since: int = 0) -> Iterator[range]:
-        """This rank's batches for all workers, as ranges of sample numbers, from the step with
-        number ``since`` on."""
-        size = self.batch_size * self.world_size
-        steps: Iterable[range] = (
-            range(i * size, (i + 1) * size) for i in count(since // size)
+    def _batches(self, position: int, since: int = 0) -> Iterator[range]:
+        """This rank's batches for all workers, as ranges of positions, from ``position`` on without
+        the first ``since`` steps."""
+        steps = self._steps(position)
+        return (
+            rank_share(steps[i], self.rank, self.world_size)
+            for i in range(since, len(steps))
         )
-        if not self.endless:
-            cut = self._steps(0, len(self.scans) - position)
-            steps = (cut[i] for i in range(since // size, len(cut)))
-        return (rank_share(step, self.rank, self.world_size) for step in steps)
 
     def __getstate__(self) -> dict[str, Any]:
         self._check()  # here, because spawned workers do not see the Accelerator
@@ -261,7 +273,9 @@ class MixedStream(Divided, IterableDataset[Any]):
         self.__dict__ |= state
         share(self._start)
 
-    def _steps(self, start: int, end: int) -> CutSteps:
+    def _steps(self, start: int) -> CutSteps:
+        """The steps from a position on, which count on over the epochs of an endless stream."""
+        end = sys.maxsize if self.endless else len(self.scans)
         # The loader's batches have a fixed size, so the remainder cannot be added to the last
         # batch.
         return cut_steps(
@@ -270,10 +284,8 @@ class MixedStream(Divided, IterableDataset[Any]):
 
     def _after(self, epoch: int, position: int, done: int) -> tuple[int, int]:
         """The epoch and position after a number of batches."""
+        steps = self._steps(position)
         if not self.endless:
-            steps = self._steps(position, len(self.scans))
             return after_batches(self.scans.mixture, epoch, steps, done)
-        epochs, position = divmod(
-            position + done * self.batch_size * self.world_size, len(self.scans)
-        )
+        epochs, position = divmod(position + done * steps.size, len(self.scans))
         return epoch + epochs, position
