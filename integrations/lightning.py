@@ -7,8 +7,8 @@ batch transfer::
     trainer.fit(model, data)
 
 Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among
-ranks itself. Training begins in the epoch that is set on the mixture. A checkpoint within an epoch
-resumes after its last batch.
+ranks itself; so does that of ``train.loader``, also with Fabric. Training begins in the epoch that
+is set on the mixture. A checkpoint within an epoch resumes after its last batch.
 """
 
 from collections.abc import Iterator, Mapping
@@ -276,7 +276,7 @@ class _Epochs:
     def _current(self) -> int:
         trainer = self._data.trainer
         if trainer is None:
-            return self._batches.dataset.epoch
+            return int(self._batches.dataset.epoch)
         # The same batches again, where they are to be overfitted.
         passes: int = 0 if trainer.overfit_batches else trainer.current_epoch
         return max(self._least, self._data._first + passes)

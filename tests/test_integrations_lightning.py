@@ -402,6 +402,18 @@ def test_lightning_does_not_share_once_more(tmp_path: Path) -> None:
         both.fit(Model(), data)
 
 
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("own", [True, False])
+def test_loaders_that_are_shared_once_more_are_refused(own: bool) -> None:
+    train = MixedScans(Scans("r", 10), Endless())
+    loader: Any = (
+        train.loader(2) if own else DataLoader(train, batch_sampler=train.batches(2))
+    )
+    fabric = lightning.Fabric(accelerator="cpu", devices=2, strategy="ddp_fork")
+    with pytest.raises(Exception, match="expected .*use_distributed_sampler=False"):
+        fabric.launch(lambda fabric: fabric.setup_dataloaders(loader))
+
+
 @pytest.mark.parametrize("version", module.STOLEN)
 def test_releases_that_steal_are_refused(
     version: str, monkeypatch: pytest.MonkeyPatch

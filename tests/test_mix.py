@@ -194,8 +194,16 @@ def test_an_argument_that_mix_does_not_have_is_refused(name: str) -> None:
 
 def test_batches_in_another_order_are_refused() -> None:
     """A state counts batches: it would resume after others than those that came."""
-    for order in ({"in_order": False}, {"shuffle": True}, {"sampler": [1, 0]}):
-        with pytest.raises(ConfigError, match=f"{next(iter(order))}.*expected"):
+    for order in (
+        {"in_order": False},
+        {"shuffle": True},
+        {"sampler": [1, 0]},
+        {"batch_sampler": [[1, 0]]},
+    ):
+        with pytest.raises(
+            ConfigError,
+            match=f"{next(iter(order))}.*expected.*use_distributed_sampler=False",
+        ):
             mixture().loader(batch_size=4, **order)
 
 

@@ -5,17 +5,16 @@ plan, so that training can resume there with another number of ranks and workers
 """
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any, Protocol
+from typing import Any
 
 from torch.utils.data import Sampler
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.labels.own import check_count
-from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, CurrentEpoch, Position
-from lidar_synth.mixing.quotas import Mixture
+from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, Position
 from lidar_synth.mixing.state import (
     Divided,
     after_batches,
@@ -26,23 +25,10 @@ from lidar_synth.mixing.state import (
 AHEAD = 1 << 20
 """Number of positions that are announced at a time to a source that works ahead."""
 
-
-class Epochs(Protocol):
-    """The part of a dataset that a batch sampler uses."""
-
-    current: CurrentEpoch
-
-    @property
-    def mixture(self) -> Mixture: ...
-
-    @property
-    def epoch(self) -> int: ...
-
-    def set_epoch(self, epoch: int) -> None: ...
-
-    def expect(self, epoch: int, positions: Iterable[int]) -> None: ...
-
-    def __len__(self) -> int: ...
+DIVIDED = (
+    "With Lightning or Fabric, set use_distributed_sampler=False: a mixture divides its batches "
+    "among the ranks itself."
+)
 
 
 @dataclass(frozen=True)
@@ -105,7 +91,7 @@ def rank_share(step: range, rank: int, world_size: int) -> range:
     return range(start, start + size + (rank < larger))
 
 
-def resume_epoch(dataset: Epochs, epoch: int, position: int) -> None:
+def resume_epoch(dataset: Any, epoch: int, position: int) -> None:
     """Set the dataset to the epoch of a loaded state.
 
     If the state marks the end of an epoch and the trainer has already set the next one, that one
@@ -133,15 +119,15 @@ class MixedBatches(Divided, Sampler[list[int]]):
         drop_last: whether to drop the samples that do not fill a batch on every rank.
 
     Raises:
-        ConfigError: on a batch size below 1 or a rank out of range; on iterating with default ranks
-            where an ``Accelerator`` is set up for several processes.
+        ConfigError: on a batch size below 1, another dataset or a rank out of range; on iterating
+            with default ranks where an ``Accelerator`` is set up for several processes.
     """
 
     call = "train.batches(...)"
 
     def __init__(
         self,
-        dataset: Epochs,
+        dataset: Any,
         batch_size: int,
         *,
         rank: int | None = None,
@@ -149,6 +135,10 @@ class MixedBatches(Divided, Sampler[list[int]]):
         drop_last: bool = False,
     ) -> None:
         check_count("batch_size", batch_size, 1)
+        if not hasattr(dataset, "mixture"):
+            raise ConfigError(
+                f"batches of a {type(dataset).__name__}", "a MixedScans", DIVIDED
+            )
         self.dataset = dataset
         self.batch_size = batch_size
         self.drop_last = drop_last

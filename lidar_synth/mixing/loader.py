@@ -7,7 +7,7 @@ from typing import Any
 from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.mixing.batches import MixedBatches
+from lidar_synth.mixing.batches import DIVIDED, MixedBatches
 from lidar_synth.mixing.epochs import REPEATED
 
 
@@ -42,11 +42,13 @@ class MixedLoader(DataLoader[Any]):
         drop_last: bool = False,
         **options: Any,
     ) -> None:
-        for name, kept in (("shuffle", False), ("sampler", False), ("in_order", True)):
+        for name in ("shuffle", "sampler", "batch_sampler", "in_order"):
+            kept = name == "in_order"
             if bool(options.get(name, kept)) != kept:
                 raise ConfigError(
                     f"{name}={options[name]} for a loader of a mixture",
                     "batches in the plan's order, which is shuffled, as state_dict counts them",
+                    DIVIDED,
                 )
         self._mixed = dataset
         self._batches: MixedBatches = dataset.batches(batch_size, drop_last=drop_last)
