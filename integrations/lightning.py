@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.generate.generator import Generated
-from lidar_synth.geometry import Source
+from lidar_synth.geometry import REAL, Source, require_finite
 from lidar_synth.mixing import Collate, MixedBatches, MixedScans
 from lidar_synth.mixing.items import copy_scan
 from lidar_synth.mixing.service.batches import Places, complete
@@ -57,7 +57,11 @@ class RealSamples(Dataset[Any]):
         return len(self.scans)
 
     def __getitem__(self, index: int) -> Any:
-        return self._to_sample(copy_scan(self.scans[index]), keyed_rng(0, index))
+        scan = self.scans[index]
+        require_finite(scan)
+        # Scans of the town count as real, as in training.
+        scan = replace(copy_scan(scan), domain=REAL)
+        return self._to_sample(scan, keyed_rng(0, index))
 
 
 class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
@@ -74,7 +78,8 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             generators on the training device; otherwise workers, which have no GPU, make them.
 
     Raises:
-        ConfigError: on a ``MixedStream``; with ``on_device``, on synthetic sources that are not
+        ConfigError: on a ``MixedStream``; on a ``MixedScans`` as ``val`` or ``test``, unless
+            ``train`` is of ``wrap``; with ``on_device``, on synthetic sources that are not
             generators.
     """
 
@@ -94,6 +99,14 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
                 f"train={type(train).__name__}",
                 "a MixedScans, whose batches resume after the last one that was trained on",
                 "Of a MixedStream: MixedData(stream.scans).",
+            )
+        if not train._real_as_is and any(
+            isinstance(scans, MixedScans) for scans in (val, test)
+        ):
+            raise ConfigError(
+                "a MixedScans for validation or test",
+                "the real scans themselves",
+                "Of MixedScans(scans, ratio=0): MixedData(train, val=scans).",
             )
         if on_device and not all(
             isinstance(source, Generated) for source in train.synthetic

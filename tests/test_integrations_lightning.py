@@ -16,7 +16,7 @@ import torch
 from mixtures import Endless, Scans
 from torch.utils.data import DataLoader
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.generator import Generated
 from lidar_synth.mixing import MixedScans
 from lidar_synth.mixing.state import make_state
@@ -119,6 +119,25 @@ def test_batches_of_validation_have_the_form_of_the_training() -> None:
     wrapped = MixedScans.wrap(Wrapped(), Endless(), **options)
     [batch] = module.MixedData(wrapped, test=Wrapped(), batch_size=3).test_dataloader()
     assert batch["first"][:, 0, 0].tolist() == [0, 1, 2]
+
+
+def test_scans_of_validation_are_real_and_finite_as_in_training() -> None:
+    train = MixedScans(Scans("r", 3), Endless())
+    town = Scans("v", 3, domain=1)
+    data = module.MixedData(train, val=town, test=town, batch_size=3)
+    [batch] = data.val_dataloader()
+    assert batch["domain"].tolist() == [0, 0, 0] and town[0].domain == 1
+    town[1].points[0] = float("nan")
+    with pytest.raises(DataError, match="'v1' with points that are NaN"):
+        list(data.test_dataloader())
+
+
+def test_mixtures_are_for_training_alone() -> None:
+    train = MixedScans(Scans("r", 3), Endless())
+    held = MixedScans(Scans("v", 3), ratio=0)
+    for name in ("val", "test"):
+        with pytest.raises(ConfigError, match="expected the real scans themselves"):
+            module.MixedData(train, **{name: held})
 
 
 def test_batches_that_are_overfitted_stay_the_same() -> None:
