@@ -12,7 +12,8 @@
 ``accelerator.prepare(loader)`` would count the passes itself, from 0, whatever epoch was set or
 resumed, and repeat samples until all batches are full (``even_batches``). Here a pass is through
 the epoch that was set or resumed, or else the next one, and all processes together load each of its
-samples once.
+samples once. Resume by ``load_state_dict``, not by ``accelerator.skip_first_batches``, of whose
+batches the prepared loader does not know.
 """
 
 from collections.abc import Iterator, Mapping
