@@ -94,7 +94,9 @@ for _name, _command in COMMANDS.items():
         _command = _load(_command, "import_" if _name == "import" else _name)
     app.command(_name)(_command)
 for _group in GROUPS:
-    app.add_typer(_load(_group, _group) if isinstance(_group, str) else _group)
+    app.add_typer(
+        _load(_group, _group) if isinstance(_group, str) else _group, cls=Commands
+    )
 
 
 def main() -> None:

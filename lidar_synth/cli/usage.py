@@ -83,9 +83,8 @@ def _explain(error: Any) -> None:
     elif message.startswith("No such command"):
         wrong = message.split("'")[1]
         hint = suggest(MEANT_COMMANDS.get(wrong, wrong), [*command.commands, "--help"])
-        said = message.split(" Did you mean")[0]
         there = ", ".join(command.commands)
-        error.message = f"{said} {hint or f'{name} has {there}.'}"
+        error.message = f"No such command {wrong!r}. {hint or f'{name} has {there}.'}"
 
 
 def _options(given: str, command: Any) -> str:
