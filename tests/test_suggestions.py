@@ -233,6 +233,13 @@ def test_the_help_of_all_commands_is_whole() -> None:
         assert "..." not in said.split("Commands:")[1]
 
 
+def test_examples_of_commands_keep_their_lines() -> None:
+    group = get_command(app)
+    assert isinstance(group, TyperGroup)
+    for name, command in group.commands.items():
+        assert not re.search(r"(?<!\x08\n)Examples?:", command.help or ""), name
+
+
 def test_a_name_like_none_has_no_suggestion() -> None:
     assert suggest("velodyne", ["kitti", "pcd"]) == ""
 

@@ -94,18 +94,13 @@ def convert(
 ) -> None:
     """Converts scans from one format to another. Run it again to resume an interrupted conversion.
 
+    \b
     Examples:
-
       lidar-synth convert KITTI-360 out --to semantic_kitti --split r2flow/test --jobs 4
-
       lidar-synth convert scans out --to pcd --on-bad skip
-
       lidar-synth convert SemanticKITTI out --to kitti --as-sensor hdl32e_nuscenes --mount 0.1,0
-
       lidar-synth convert bank out --to webdataset --jobs 4
-
       lidar-synth convert kitti out --to range --unfold
-
       lidar-synth convert clouds out --to kitti --reflectance-max 255 --on-bad drop-points
     """
     from lidar_synth.errors import choose

@@ -36,17 +36,13 @@ def import_(
     With --check, four scans are generated: the share of cells with a return, a histogram of ranges
     and a picture beside the checkpoint show whether weights and conventions fit.
 
+    \b
     Examples:
-
       lidar-synth import r2flow-kitti360-1rf.pth r2flow-1rf.safetensors
-
       lidar-synth import r2flow-kitti360-1rf.pth r2flow-1rf.safetensors --check
-
       lidar-synth sample scans --model r2flow-1rf.safetensors --count 16 --steps 32
-
       lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm
-      (config.yaml beside model.ckpt)
-
+          (config.yaml beside model.ckpt)
       lidar-synth import diffusion_0000300000.pth r2dm.safetensors --peer r2dm
     """
     from lidar_synth.generate.checkpoint import VELOCITY, save_checkpoint
