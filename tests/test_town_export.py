@@ -81,7 +81,7 @@ def test_scans_read_from_an_exported_town_are_synthetic(
 
 def test_labels_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> None:
     layout, root = written
-    if layout == "kitti":
+    if layout == "kitti_object":
         pytest.skip("KITTI's object set has no label per point")
     read = open_scans(root)
     for i, scan in enumerate(scans):
@@ -95,7 +95,7 @@ def test_labels_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> N
 
 def test_poses_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> None:
     layout, root = written
-    if layout == "kitti":
+    if layout == "kitti_object":
         pytest.skip("KITTI's object set has no poses")
     for i, scan in enumerate(scans):
         pose = open_scans(root)[i].pose
@@ -107,7 +107,7 @@ def test_boxes_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> No
     layout, root = written
     if layout == "semantic_kitti":
         pytest.skip("SemanticKITTI has no boxes")
-    tolerance = 0.02 if layout == "kitti" else 1e-3
+    tolerance = 0.02 if layout == "kitti_object" else 1e-3
     for i, scan in enumerate(scans):
         read = open_scans(root)[i].boxes
         boxes = scan.boxes
@@ -115,14 +115,16 @@ def test_boxes_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> No
         # label_2 lists only objects in the image; KITTI-360's reader drops boxes centred beyond the
         # sensor's range.
         near = np.linalg.norm(boxes.values[:, :2], axis=1) < scan.sensor.range_max - 1
-        expected = boxes[boxes.truncation >= 0] if layout == "kitti" else boxes[near]
+        expected = (
+            boxes[boxes.truncation >= 0] if layout == "kitti_object" else boxes[near]
+        )
         assert len(read) >= len(expected) > 0
         for value, name in zip(expected.values, expected.names, strict=True):
             distance = np.linalg.norm(read.values[:, :3] - value[:3], axis=1)
             match = int(distance.argmin())
             assert distance[match] < 3 * tolerance
             assert np.allclose(read.values[match, 3:6], value[3:6], atol=tolerance)
-            if layout == "kitti":
+            if layout == "kitti_object":
                 assert read.names[match] == name
 
 
@@ -130,7 +132,7 @@ def test_kitti_labels_have_occlusion_truncation_and_image_boxes(
     written: tuple[str, Path], scans: list[Scan]
 ) -> None:
     layout, root = written
-    if layout != "kitti":
+    if layout != "kitti_object":
         pytest.skip("only KITTI's object set")
     read = KITTIObject(root)[0].boxes
     boxes = scans[0].boxes
@@ -270,7 +272,7 @@ def test_a_folder_is_not_continued_by_a_town_of_other_tables(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = Town(5, "pandar64", 0)
-    export_town(before, tmp_path, "kitti", camera=False, progress=False)
+    export_town(before, tmp_path, "kitti_object", camera=False, progress=False)
     identity = before.identity
     monkeypatch.setattr("lidar_synth.lab.town.town.TABLES_HASH", "other clothes")
     assert before.identity != identity
@@ -288,7 +290,10 @@ def test_scans_and_their_folder_name_their_skin_and_its_licence(tmp_path: Path) 
     export_town(town, tmp_path, "kitti_object", camera=False, progress=False)
     text = (tmp_path / "README.md").read_text()
     assert "PandaSet by Scale AI and Hesai" in text and "licence: CC BY 4.0" in text
-    assert "layout: kitti;" in text
+    assert "layout: kitti_object;" in text
+    # As earlier versions called it.
+    assert '"layout": "kitti"' in (tmp_path / "town.json").read_text()
+    assert export_town(town, tmp_path, "kitti", camera=False, progress=False) == (0, 1)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from pydantic.fields import FieldInfo
 from typer import Argument, BadParameter, Option
 
 FORMATS = (
-    "output format: npz (keeps every field) | kitti | semantic_kitti | kitti_object | kitti360 | "
-    "range | pcd | ply | png | webdataset | mcap | cosmos"
+    "output format: npz (keeps every field) | kitti (.bin and .label files) | semantic_kitti | "
+    "kitti_object | kitti360 | range | pcd | ply | png | webdataset | mcap | cosmos"
 )
 """Help of ``--to``; names of ``formats.WRITERS``."""
 

@@ -15,9 +15,7 @@ def town(
     ] = 0,
     layout: Annotated[
         str,
-        Option(
-            help="folder layout: kitti360 | semantic_kitti | kitti (or kitti_object)"
-        ),
+        Option(help="folder layout: kitti360 | semantic_kitti | kitti_object"),
     ] = "kitti360",
     sensor: Annotated[
         str, Option(help="sensor that casts the rays: a preset or a YAML file")
@@ -55,7 +53,7 @@ def town(
     \b
     Examples:
       lidar-synth town my_town --scans 1000 --seed 1 --layout semantic_kitti --no-camera --jobs 4
-      lidar-synth town my_town --scans 100 --layout kitti
+      lidar-synth town my_town --scans 100 --layout kitti_object
       lidar-synth town my_town --scans 500 --sensor os1_128 --no-camera
       lidar-synth town my_town --scans 100 --accumulate --no-camera
       lidar-synth town my_town --scans 500 --skin my.skin --no-camera

@@ -31,7 +31,7 @@ from lidar_synth.lab.town.world import STRETCH_FRAMES
 LAYOUTS: dict[str, type[Writer]] = {
     "kitti360": KITTI360Writer,
     "semantic_kitti": SemanticKITTIWriter,
-    "kitti": KITTIObjectWriter,
+    "kitti_object": KITTIObjectWriter,
 }
 """The writer of each layout by name."""
 
@@ -69,7 +69,7 @@ def export_town(
     Args:
         town: the town to export.
         out: the folder to write to.
-        layout: one of ``LAYOUTS``; ``kitti_object`` is another name of ``kitti``.
+        layout: one of ``LAYOUTS``; ``kitti`` is another name of ``kitti_object``.
         sequence: number of the drive or sequence to write, 0 to 99; ``SEQUENCES`` by default.
         camera: whether to render and write the camera image of each scan.
         accumulate: whether to write accumulated clouds beside the scans of layout ``kitti360``, see
@@ -85,8 +85,8 @@ def export_town(
             another layout or of too many scans, or a folder that holds another town.
         FileError: if the output cannot be written.
     """
-    if layout == "kitti_object":
-        layout = "kitti"
+    if layout == "kitti":
+        layout = "kitti_object"
     choose("layout", layout, LAYOUTS)
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
@@ -147,7 +147,8 @@ def _claim_folder(
         "camera": camera,
         **town.settings,
     }
-    claim(out / SETTINGS, settings)
+    # kitti, as earlier versions wrote it
+    claim(out / SETTINGS, settings | {"layout": layout.removesuffix("_object")})
     if not (out / "README.md").exists():
         names = {
             "sensor": escape_markdown(town.sensor.name),
