@@ -296,8 +296,7 @@ def _check_disjoint(banks: Sequence[Bank]) -> None:
                 overlap = other.first < _end(entry) and entry.first < _end(other)
                 if overlap and (both := _kept(other) & _kept(entry)):
                     raise ConfigError(
-                        f"{root} and {bank.root} both hold scan {min(both)} of seed "
-                        f"{entry.seed}",
+                        f"{root} and {bank.root} both hold scan {min(both)} of seed {entry.seed}",
                         "every scan only once",
                         "Bake with another --seed, or a --first after the end of the other bank.",
                     )

@@ -81,8 +81,7 @@ def _ended(code: int) -> FileError:
     return FileError(
         f"a worker was killed (exit status {code})",
         "enough memory for all workers",
-        "Run the same command again, possibly with fewer workers: finished shards are "
-        "kept.",
+        "Run the same command again, possibly with fewer workers: finished shards are kept.",
     )
 
 

@@ -252,7 +252,5 @@ bank = Typer(
     help="Makes new banks from existing ones: merge, split, head, as-sensor.",
     no_args_is_help=True,
 )
-bank.command("merge")(merge)
-bank.command("split")(split)
-bank.command("head")(head)
-bank.command("as-sensor")(as_sensor)
+for _command in (merge, split, head, as_sensor):
+    bank.command()(_command)

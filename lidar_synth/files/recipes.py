@@ -132,10 +132,9 @@ def _base(path: Path, name: Any) -> Path:
         path.parent / str(name),
         path.parent / "base" / f"{name}.yaml",
         path.parent / f"{name}.yaml",
+        folder() / "base" / f"{name}.yaml",
+        folder() / f"{name}.yaml",
     ):
-        if candidate.is_file() and candidate != path:
-            return candidate
-    for candidate in (folder() / "base" / f"{name}.yaml", folder() / f"{name}.yaml"):
         if candidate.is_file() and candidate != path:
             return candidate
     raise ConfigError(

@@ -70,8 +70,7 @@ class PredictLabels:
         confidence = None if answer[1] is None else np.asarray(answer[1])
         if not (_are_labels(label, len(scan)) and _are_shares(confidence, len(scan))):
             raise DataError(
-                f"the teacher's labels of scan {scan.id!r}, {label.shape} for {len(scan)} "
-                "points",
+                f"the teacher's labels of scan {scan.id!r}, {label.shape} for {len(scan)} points",
                 "train ids 0..18 or 255 and confidences in [0, 1], one of each per point",
             )
         if confidence is not None:

@@ -129,8 +129,9 @@ def train_segmenter(
             network.train()
         bar.update()
         if progress:  # it waits for a GPU
-            recent = losses[max(0, done - 20) : done].mean()
-            bar.set_postfix(loss=f"{recent:.3f}", refresh=False)
+            bar.set_postfix(
+                loss=f"{losses[max(0, done - 20) : done].mean():.3f}", refresh=False
+            )
     bar.close()
     network.eval()
     if done < steps:

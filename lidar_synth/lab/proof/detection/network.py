@@ -169,8 +169,9 @@ def train(
         losses[done] = loss.detach()
         done += 1
         if done % SHOWN_EVERY == 0:  # it waits for a GPU
-            recent = losses[done - SHOWN_EVERY : done].mean()
-            bar.set_postfix(loss=f"{recent:.3f}", refresh=False)
+            bar.set_postfix(
+                loss=f"{losses[done - SHOWN_EVERY : done].mean():.3f}", refresh=False
+            )
     found: list[float] = losses[:done].tolist()
     return found
 
