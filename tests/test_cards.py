@@ -11,7 +11,7 @@ from PIL import Image
 from project import ROOT
 
 from lidar_synth import load_generator
-from lidar_synth.generate.loading import shipped_models
+from lidar_synth.files.hub import shipped_models
 
 CARD = ROOT / "docs" / "models"
 PICTURE = re.compile(r"\]\(gallery/(\w+)\.png\)")

@@ -434,6 +434,17 @@ def test_every_trainer_finds_the_sequences(tmp_path: Path) -> None:
         assert (read / "dataset" / "sequences").samefile(root / "sequences")
 
 
+def test_the_recipes_command_refuses_a_folder_with_the_name_of_a_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("town").mkdir()
+    given = "recipes --trainer openpcdet --root town --synthetic"
+    assert CliRunner().invoke(app, [*given.split(), "./town"]).exit_code == 0
+    refused = CliRunner().invoke(app, [*given.split(), "town"])
+    assert "Write ./town for the folder" in str(refused.exception)
+
+
 def test_the_recipes_command_writes_a_trainers_files(tmp_path: Path) -> None:
     given = f"recipes --trainer openpcdet --root KITTI --synthetic town --out {tmp_path / 'mixed'}"
     result = CliRunner().invoke(app, given.split())

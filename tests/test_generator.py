@@ -16,11 +16,12 @@ from PIL import Image
 from small_models import GRID, SENSOR, write
 
 import lidar_synth.generate.devices as devices
-import lidar_synth.generate.loading as loading
 from lidar_synth.bake.job import make_plan
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.files import hub
+from lidar_synth.files.hub import shipped_models
 from lidar_synth.generate.checkpoint import (
     CODEC,
     VELOCITY,
@@ -32,7 +33,7 @@ from lidar_synth.generate.conditions import GAP, bridge_gaps
 from lidar_synth.generate.flow.solvers import solve, uniform_grid
 from lidar_synth.generate.generator import Generator
 from lidar_synth.generate.inpaint import check_model, inpaint
-from lidar_synth.generate.loading import load_generator, shipped_models
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.generate.models import NETWORKS, build_network
 from lidar_synth.generate.models.network import Autoencoder
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
@@ -325,7 +326,7 @@ def test_models_are_found_by_shipped_name_or_by_path(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "weights").mkdir()
-    monkeypatch.setattr(loading, "files", lambda package: tmp_path)
+    monkeypatch.setattr(hub, "files", lambda package: tmp_path)
     with pytest.raises(
         ConfigError,
         match=r"model 'town'; expected a shipped one \(none in this installation\)",
@@ -442,7 +443,7 @@ def test_a_damaged_shipped_checkpoint_is_refused(
     for key in (b'range_max\\": 80.', b'time_grid\\": [1.0, 0.'):
         place = content.index(key) + len(key)
         damaged.write_bytes(content[:place] + b"9" + content[place + 1 :])
-        monkeypatch.setattr(loading, "files", lambda package: tmp_path)
+        monkeypatch.setattr(hub, "files", lambda package: tmp_path)
         with pytest.raises(DataError, match="does not match its checksum"):
             load_generator("town")
 

@@ -66,6 +66,17 @@ def test_synthetic_scans_by_name(tmp_path: Path) -> None:
     )
 
 
+def test_a_folder_with_the_name_of_a_model_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would be taken without a word in the place of the model."""
+    synthetic(tmp_path / "town", 2)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"both a model and .*Write \./town for the"):
+        mix_for_trainer(4, {"synthetic": "town", "ratio": 0.5}, as_is)
+    assert len(open_synthetic("./town")) == len(open_synthetic(Path("town"))) == 2
+
+
 def test_real_samples_of_a_mixture_are_numbers(tmp_path: Path) -> None:
     mixed = mix_for_trainer(6, {"synthetic": Endless(), "ratio": 0.4, "seed": 1}, as_is)
     samples = [mixed[i] for i in range(len(mixed))]

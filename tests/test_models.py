@@ -18,8 +18,8 @@ from latent_runs import call, one_thread, scans, write_config  # noqa: F401 - fi
 
 from lidar_synth import load_generator
 from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.files.hub import shipped_models
 from lidar_synth.generate.checkpoint import load_checkpoint, read_header
-from lidar_synth.generate.loading import shipped_models
 from lidar_synth.lab.train import (
     DistillConfig,
     TrainConfig,

@@ -30,9 +30,9 @@ from lidar_synth.bank.encoding import Encoding
 from lidar_synth.cli.bake import bake
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.hub import shipped_models
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.generator import Generated, Generator
-from lidar_synth.generate.loading import shipped_models
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.lab.evaluate.conditions import sight_agreement
@@ -55,7 +55,8 @@ def test_models_load_without_the_compiler_of_torch_and_draw_nothing() -> None:
     code = """if True:
         import sys
         import torch
-        from lidar_synth.generate.loading import load_generator, shipped_models
+        from lidar_synth.files.hub import shipped_models
+        from lidar_synth.generate.loading import load_generator
         before = torch.get_rng_state()
         for name in shipped_models():
             load_generator(name)

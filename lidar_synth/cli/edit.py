@@ -68,7 +68,7 @@ def remove_objects(
     \b
     Examples:
       lidar-synth edit remove KITTI out --name Car --to kitti_object
-      lidar-synth edit remove town out --scan 0 --box 3 --model town --sensor hdl64e_lasers
+      lidar-synth edit remove streets out --scan 0 --box 3 --model town --sensor hdl64e_lasers
     """
     from lidar_synth.errors import ConfigError
     from lidar_synth.labels.edit import remove
@@ -105,7 +105,7 @@ def insert_object(
 
     \b
     Example:
-      lidar-synth edit insert town out --objects objects.npz --number 12 --at 14,-3
+      lidar-synth edit insert streets out --objects objects.npz --number 12 --at 14,-3
     """
     from lidar_synth.errors import ConfigError
     from lidar_synth.labels import ObjectBank

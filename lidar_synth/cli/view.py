@@ -44,7 +44,7 @@ def view(
     Examples:
       lidar-synth view scan.bin
       lidar-synth view kitti/ --index 7 --out scan.png
-      lidar-synth view town/ --count 16 --out town.html
+      lidar-synth view streets/ --count 16 --out streets.html
       lidar-synth view logs/ --sensor fitted.yaml --reflectance-max 255
     """
     from lidar_synth.formats import open_scans

@@ -1,4 +1,5 @@
-"""Models and banks on the Hugging Face hub: their names, cards and uploads (extra ``hub``).
+"""Models by name: those that ship with the package, and models and banks on the Hugging Face hub,
+their cards and uploads (extra ``hub``).
 
 ``hf://user/model`` names a model and ``hf://datasets/user/bank`` a bank; ``@REVISION`` behind it is
 a branch, a tag or the hash of a commit. Everything is read from one commit, so that what others
@@ -10,6 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +75,26 @@ class Repository:
             )
         kind = "dataset" if found[1] else "model"
         return cls(kind, found[2], found[3], found[4])
+
+
+def shipped_models() -> dict[str, Path]:
+    """The checkpoints that ship with the package: {name: path}."""
+    folder = Path(str(files("lidar_synth"))) / "weights"
+    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+
+
+def refuse_ambiguous(name: Any) -> None:
+    """Refuse the name of a shipped model that is also the name of a folder here.
+
+    Raises:
+        ConfigError: on such a name.
+    """
+    if name in shipped_models() and Path(name).is_dir():
+        raise ConfigError(
+            f"{name!r}, which is both a model and a folder here",
+            "a name of one of them",
+            f"Write ./{name} for the folder; for the model, rename the folder.",
+        )
 
 
 def is_on_hub(name: object) -> bool:

@@ -1,6 +1,5 @@
 """Loading of generators: shipped models by name, checkpoints by path."""
 
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ import torch
 from torch import nn
 
 from lidar_synth.errors import ConfigError, DataError, suggest
-from lidar_synth.files.hub import fetch_model, is_on_hub, pin_model
+from lidar_synth.files.hub import fetch_model, is_on_hub, pin_model, shipped_models
 from lidar_synth.generate.checkpoint import (
     CODEC,
     VELOCITY,
@@ -93,12 +92,6 @@ def _compile(networks: dict[str, nn.Module]) -> None:
         codec.decode = torch.compile(codec.decode, dynamic=False)
 
 
-def shipped_models() -> dict[str, Path]:
-    """The checkpoints that ship with the package: {name: path}."""
-    folder = Path(str(files("lidar_synth"))) / "weights"
-    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
-
-
 def find_model(model: str | Path) -> Path:
     """The checkpoint file of a shipped model or of one on the hub, or the given path itself.
 
@@ -109,9 +102,7 @@ def find_model(model: str | Path) -> Path:
     if is_on_hub(model):
         return fetch_model(str(model))
     shipped = shipped_models()
-    if (name := str(model)) in shipped:
-        return shipped[name]
-    path = Path(model)
+    path = shipped.get(str(model), Path(model))
     if path.suffix != ".safetensors":
         names = ", ".join(shipped) or "none in this installation"
         expected = f"a shipped one ({names}), a .safetensors file or hf://user/model"

@@ -13,6 +13,7 @@ import numpy as np
 from lidar_synth.bank import Bank, is_bank
 from lidar_synth.bank.storage import is_url
 from lidar_synth.errors import ConfigError, DataError, choose
+from lidar_synth.files.hub import refuse_ambiguous
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.as_sensor import make_transfer, read_transfer
@@ -58,7 +59,8 @@ def open_synthetic(where: Any) -> Any:
             FOLDER, "limit": "200GB"}`` opens a ``Bank``. Any other object is returned unchanged.
 
     Raises:
-        ConfigError, FileError, DataError: if there is no such source.
+        ConfigError, FileError, DataError: if there is no such source, or both a model and a
+            folder of this name.
     """
     if isinstance(where, Mapping) and "root" in where:
         for key in where:
@@ -68,6 +70,7 @@ def open_synthetic(where: Any) -> Any:
         return where
     if is_url(where):
         return Bank(where)
+    refuse_ambiguous(where)
     if not os.path.isdir(where):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
         # imported only if a model is named, because it loads networks
         from lidar_synth.generate.loading import load_generator

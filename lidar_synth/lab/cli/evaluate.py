@@ -120,11 +120,11 @@ def evaluate(
     Examples:
       lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test \\
           --weights metrics --beside
-      lidar-synth town town --scans 500 --seed 1 && \\
-          lidar-synth evaluate town samples --protocol town --json
-      lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
-      lidar-synth evaluate SemanticKITTI town --objects
-      lidar-synth evaluate KITTI town --detector pointpillar_7728.pth
+      lidar-synth town streets --scans 500 --seed 1 && \\
+          lidar-synth evaluate streets samples --protocol town --json
+      lidar-synth evaluate SemanticKITTI streets --judge squeezeseg --columns 1024
+      lidar-synth evaluate SemanticKITTI streets --objects
+      lidar-synth evaluate KITTI streets --detector pointpillar_7728.pth
     """
     from lidar_synth.errors import choose
     from lidar_synth.formats import open_scans

@@ -106,6 +106,7 @@ def _configure(
     out: Path | None,
 ) -> None:
     """Print or write the files of a trainer."""
+    from lidar_synth.files.hub import refuse_ambiguous
     from lidar_synth.lab.start.trainers import (
         DEFAULTS,
         configure,
@@ -114,6 +115,7 @@ def _configure(
     )
 
     task = task or tasks_of(trainer)[0]
+    refuse_ambiguous(synthetic)
     # The trainer runs in its own folder; names and URLs stay.
     root, synthetic = (
         str(Path(given).resolve()) if Path(given).exists() else given

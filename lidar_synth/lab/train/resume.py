@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.hub import shipped_models
 from lidar_synth.generate.checkpoint import Header, read_header
-from lidar_synth.generate.loading import find_model, shipped_models
+from lidar_synth.generate.loading import find_model
 from lidar_synth.lab.train.config import PARENTS, Run, read_values, validate
 from lidar_synth.lab.train.config.load import Config
 from lidar_synth.lab.train.schedules import SCHEDULES
