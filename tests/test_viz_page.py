@@ -128,7 +128,8 @@ def test_the_page_contains_the_range_images(page: str, scans: list[Scan]) -> Non
     colours = make_scales(scans)
     for scan, packed in zip(scans, page_data(page)["scans"], strict=True):
         image = project(scan)
-        channels = ["range", "reflectance"] + ["label"] * (scan.label is not None)
+        own = [name for name in ("label", "confidence") if name in scan.fields()]
+        channels = ["range", "reflectance", *own]
         assert [p["title"] for p in packed["pictures"]] == [
             colours[c].title for c in channels
         ]

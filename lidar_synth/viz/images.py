@@ -12,7 +12,7 @@ from lidar_synth.geometry import RangeImage, Scan, require_finite, require_refle
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.viz.scales import EMPTY, Rgb, Scale, make_scales
 
-CHANNELS = ("range", "reflectance", "label")
+CHANNELS = ("range", "reflectance", "label", "confidence")
 """The channels of a range image that are shown, if it has them."""
 
 
