@@ -1,4 +1,4 @@
-"""75 mistakes of newcomers, on the command line, in Python and in YAML: each is answered in one
+"""76 mistakes of newcomers, on the command line, in Python and in YAML: each is answered in one
 line that names the option or what was expected and, for names, the nearest ones."""
 
 import re
@@ -73,6 +73,7 @@ COMMANDS = {
     "label kiti360 SCANS OUT": "Did you mean 'kitti360'",
     "labels kitti360 SCANS OUT": "Did you mean 'label'",
     "metrics lst": "lidar-synth metrics has",
+    "bank --deep": "lidar-synth bank. It has --help.",
     "generate OUT": "Did you mean 'sample'",
     "mix SCANS BANK": "Did you mean 'check-mix'",
     "help": "Did you mean '--help'",
@@ -118,8 +119,8 @@ YAML = {
 """By file of a mixture: what the error says."""
 
 
-def test_they_are_75() -> None:
-    assert len(COMMANDS) + len(PYTHON) + len(YAML) == 75
+def test_they_are_76() -> None:
+    assert len(COMMANDS) + len(PYTHON) + len(YAML) == 76
 
 
 @pytest.fixture(scope="module")

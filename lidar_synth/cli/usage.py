@@ -99,4 +99,4 @@ def _options(given: str, command: Any) -> str:
         return "Keys of a recipe are given as key=value, such as recipe.iterations=3."
     if given == "--output" and any(param.name == "out" for param in command.params):
         return "The folder is the argument OUT."
-    return suggest(given, names) or f"It has {', '.join(names)}."
+    return suggest(given, names) or f"It has {', '.join([*names, '--help'])}."
