@@ -387,7 +387,7 @@ def test_there_is_one_worker_for_each_core_that_may_be_used(
     (tmp_path / "cpu.max").write_text(quota)
     monkeypatch.setattr(processes, "QUOTA", tmp_path / "cpu.max")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: allowed, raising=False)
-    assert _resources(plan, None, None, None).workers == workers
+    assert _resources(plan, "processes", None, None, None).workers == workers
 
 
 @pytest.mark.parametrize(

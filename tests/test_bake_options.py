@@ -9,6 +9,7 @@ import torch
 from small_models import write
 from typer.testing import CliRunner
 
+from lidar_synth.bake.estimate import Estimate
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, LibraryError
 
@@ -32,9 +33,29 @@ def test_a_dry_run_needs_no_gpu_where_the_bake_needs_none(
     output = run(model, tmp_path, on_slurm).output
     assert "4 scans in 1 shard of up to 64" in output
     assert "fields: range, label; " in output
-    assert "seconds with one worker on a cpu, " in output
+    assert "seconds with 1 worker on a cpu, " in output
     with pytest.raises(ConfigError, match="device 'cuda'"):
         run(model, tmp_path, "--device cuda --dry-run")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    {
+        "": "8.0 minutes with 1 worker, 0.01 scans/s",
+        "--workers 2": "4.0 minutes with 2 workers, 0.02 scans/s",
+        "--workers 16": "2.0 minutes with 4 workers, 0.03 scans/s",
+    }.items(),
+)
+def test_a_dry_run_divides_the_time_by_the_workers(
+    options: str,
+    said: str,
+    model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    measured = Estimate(1e6, 480.0, "cpu")
+    monkeypatch.setattr("lidar_synth.bake.estimate.estimate", lambda plan: measured)
+    assert said in run(model, tmp_path, f"--shard-size 1 {options} --dry-run").output
 
 
 def test_unboxed_objects_are_counted_once(tmp_path: Path) -> None:

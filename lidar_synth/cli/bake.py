@@ -94,16 +94,16 @@ def bake(
     from lidar_synth.bake.share import read_share
 
     share = read_share(shard_index, num_shards)
-    options = {"workers": workers, "address": address, "slurm": slurm}
+    options: dict[str, Any] = {"workers": workers, "address": address, "slurm": slurm}
     plan = _plan(out, config, drop_missing(settings))
-    resources = _resources(plan, workers, address, slurm)
     engine = engine or (
         "slurm" if slurm else "ray" if address else "processes" if workers else "local"
     )
     _refuse_ignored(engine, options)
-    _report_idle(plan, engine, resources, share)
+    resources = _resources(plan, engine, **options)
+    _report_idle(plan, resources, share)
     if dry_run:
-        _describe(plan, engine)
+        _describe(plan, engine, resources)
     else:
         _run(out, plan, engine, resources, share)
 
@@ -119,7 +119,11 @@ def _plan(out: str, config: Path | None, given: dict[str, Any]) -> "BakePlan":
 
 
 def _resources(
-    plan: "BakePlan", workers: int | None, address: str | None, slurm: list[str] | None
+    plan: "BakePlan",
+    engine: str,
+    workers: int | None,
+    address: str | None,
+    slurm: list[str] | None,
 ) -> "Resources":
     import torch
 
@@ -136,8 +140,10 @@ def _resources(
             )
         options[key] = int(value) if value.isdigit() else value
     if workers is None:
-        cuda = plan.job.device == "cuda"
-        workers = (torch.cuda.device_count() if cuda else usable_cores()) or 1
+        workers = 1
+        if engine in TAKEN_BY["workers"]:
+            cuda = plan.job.device == "cuda"
+            workers = (torch.cuda.device_count() if cuda else usable_cores()) or 1
     return Resources(workers, address, options)
 
 
@@ -146,17 +152,17 @@ def _refuse_ignored(engine: str, options: dict[str, Any]) -> None:
 
     for name in filter(options.get, options):
         if engine not in TAKEN_BY[name]:
-            engines = " or ".join(map(repr, TAKEN_BY[name]))
-            raise ConfigError(f"--{name} with engine {engine!r}", f"engine {engines}")
+            raise ConfigError(
+                f"--{name} with engine {engine!r}",
+                f"engine {' or '.join(map(repr, TAKEN_BY[name]))}",
+            )
 
 
-def _report_idle(
-    plan: "BakePlan", engine: str, resources: "Resources", share: "Share"
-) -> None:
+def _report_idle(plan: "BakePlan", resources: "Resources", share: "Share") -> None:
     mine = len(range(len(plan.shards))[share.index :: share.of])
     workers = resources.workers
     size = plan.job.count // (workers * share.of)
-    if engine in TAKEN_BY["workers"] and mine < workers and size:
+    if mine < workers > 1 and size:
         echo(
             f"{_shards(mine)} for {workers} workers: --shard-size {size} of a new bank uses all"
         )
@@ -211,7 +217,7 @@ def _report_unboxed(bank: str) -> None:
         )
 
 
-def _describe(plan: "BakePlan", engine: str) -> None:
+def _describe(plan: "BakePlan", engine: str, resources: "Resources") -> None:
     """Print what a bake would write; the time and size are estimated from a few scans."""
     from lidar_synth.bake.estimate import estimate
     from lidar_synth.bake.folder import check_settings
@@ -223,21 +229,23 @@ def _describe(plan: "BakePlan", engine: str) -> None:
     shards = plan.shards
     expected = estimate(plan)
     size = expected.bytes / 1e6
-    minutes = expected.seconds / 60
+    workers = min(resources.workers, len(shards))
+    seconds = expected.seconds / workers
+    minutes = seconds / 60
     disk = f"{size:.3g} MB" if size < 1000 else f"{size / 1e3:.3g} GB"
     time = f"{minutes:.1f} minutes" if minutes < 120 else f"{minutes / 60:.1f} hours"
     if minutes < 2:
-        time = f"{expected.seconds:.0f} seconds"
+        time = f"{seconds:.0f} seconds"
     elsewhere = "" if expected.device == job.device else f" on a {expected.device}"
-    shard = size / job.count * max(entry.scans for entry in shards)
+    shard = size / job.count * shards[0].scans
     echo(
-        f"{plan.out}: {job.count} scans in {_shards(len(shards))} of up to "
-        f"{job.shard_size}\n"
+        f"{plan.out}: {job.count} scans in {_shards(len(shards))} of up to {job.shard_size}\n"
         f"  model {plan.facts.model} {plan.facts.checkpoint[:12]}, sensor "
         f"{plan.facts.sensor.name}\n"
         f"  fields: {', '.join(('range', *plan.facts.fields))}; label policy "
         f"{plan.facts.label_policy}\n"
         f"  about {disk}, {expected.bytes / job.count / 1e3:.0f} kB per scan\n"
-        f"  about {time} with one worker{elsewhere}, {job.count / expected.seconds:.2f} scans/s\n"
+        f"  about {time} with {workers} worker{'s' * (workers > 1)}{elsewhere}, "
+        f"{job.count / seconds:.2f} scans/s\n"
         f"  up to {2 * shard:.3g} MB of memory a worker for its shard, beside the model"
     )

@@ -278,10 +278,9 @@ def _cuda() -> Iterator[Finding]:
         yield Finding("devices", "CUDA", "check", f"{type(error).__name__}: {error}")
         return
     for number, card in enumerate(cards):
-        memory = card.total_memory / 2**30
         found = (
-            f"{card.name}, {memory:.0f} GiB, compute {card.major}.{card.minor}, CUDA "
-            f"{torch.version.cuda}"
+            f"{card.name}, {card.total_memory / 2**30:.0f} GiB, compute {card.major}.{card.minor}, "
+            f"CUDA {torch.version.cuda}"
         )
         yield Finding("devices", f"cuda:{number}", "ok", found)
     if cards:
