@@ -366,8 +366,12 @@ def test_a_plan_says_how_many_labelled_scans_each_training_gets() -> None:
     source = Scans([*names, "01/000000", "02/000000"])
     plan, _ = make_plan(source, SMALL, None, 1)
     assert "each training gets 2 to 7 labelled scans" in describe_plan(plan)
-    plan, _ = make_plan(source, replace(SMALL, labelled=1), None, 1)
-    assert "each training gets 1 labelled scan and" in describe_plan(plan)
+    arms = ("pretrain", "pretrain-generator", "recipe")
+    plan, _ = make_plan(source, replace(SMALL, labelled=1, arms=arms), None, 1)
+    said = describe_plan(plan)
+    assert "each training gets 1 labelled scan and" in said
+    assert said.count("constants") == 1 and "constants" in said.splitlines()[-1]
+    assert "  pretrain-generator  " in said
 
 
 def test_scans_of_other_places_are_tested_by_one_training_for_each_seed() -> None:

@@ -39,7 +39,9 @@ class ArmStage:
     labels: Labels = "generated"
 
 
-_TOWN = f"labels of the town, which cost nothing ({CALIBRATED_ON})"
+CONSTANTS = f" ({CALIBRATED_ON})"
+"""Behind the labels of the town: the real scans that it owes something to."""
+_TOWN = f"labels of the town, which cost nothing{CONSTANTS}"
 GENERATOR_BUDGET = "what the generator was trained on"
 _BUDGETS = {
     "town": _TOWN,

@@ -11,7 +11,7 @@ from typing import Any
 from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.geometry import Sensor, spread
-from lidar_synth.lab.proof.arms import Row
+from lidar_synth.lab.proof.arms import CONSTANTS, Row
 from lidar_synth.lab.proof.places import Places
 from lidar_synth.lab.proof.pools import MOST_SKIN_SCANS
 from lidar_synth.lab.proof.scores import Groups
@@ -136,8 +136,9 @@ def count_scans(numbers: Collection[int], kind: str) -> str:
 def describe(plan: ProofPlan) -> str:
     """The plan in words, for a user who decides whether to start it."""
     tested = sorted({place for place, _ in plan.pairs})
-    left_out = "a place that was left out"
-    where = left_out if plan.training is None else "all tested places"
+    where = (
+        "a place that was left out" if plan.training is None else "all tested places"
+    )
     lines = [
         f"{len(plan.names)} scans of {plan.sensor.name} in {len(plan.places)} places: "
         + ", ".join(
@@ -153,7 +154,7 @@ def describe(plan: ProofPlan) -> str:
         count = round(plan.settings.iterations * row.arm.iterations)
         uses = f" (uses {row.arm.budget})" if row.arm.budget else ""
         lines.append(
-            f"  {row.key:<16}{count} iterations of {plan.settings.batch}: {row.title}{uses}"
+            f"  {row.key:<20}{count} iterations of {plan.settings.batch}: {row.title}{uses}"
         )
     time = (
         f"about {plan.minutes:.0f} minutes with {plan.jobs} processes"
@@ -161,4 +162,7 @@ def describe(plan: ProofPlan) -> str:
         else "time: that of your trainer"
     )
     count = len(plan.rows) * len(plan.trainings(plan.pairs))
-    return "\n".join([*lines, f"{count} trainings; {time}"])
+    # The same words for every arm, once below.
+    parts = "\n".join([*lines, f"{count} trainings; {time}"]).split(CONSTANTS)
+    note = f"\nlabels of the town{CONSTANTS}" if len(parts) > 1 else ""
+    return "".join(parts) + note

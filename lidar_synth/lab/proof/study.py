@@ -23,7 +23,7 @@ from lidar_synth.files.processes import map_in_processes, usable_cores
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.geometry import Scan, Source
 from lidar_synth.lab.evaluate.leakage import refuse_leaks
-from lidar_synth.lab.proof.arms import Row
+from lidar_synth.lab.proof.arms import CONSTANTS, Row
 from lidar_synth.lab.proof.beams import keep_beams
 from lidar_synth.lab.proof.page import body, write_body
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
@@ -47,7 +47,6 @@ from lidar_synth.lab.proof.trial import (
     reference,
     run_trainer,
 )
-from lidar_synth.lab.town.returns import CALIBRATED_ON
 
 STUDY = "study.json"
 GENERATOR = "generator.json"
@@ -222,7 +221,7 @@ def prove(
         recordings = seen_by(generator.header.provenance)
         seen = str(recordings) or "scans that its file does not name"
         if any(dataset == TOWN for dataset, _ in recordings.drives):
-            seen += f" ({CALIBRATED_ON})"
+            seen += CONSTANTS
     named = getattr(
         trainer, "command", getattr(trainer, "__name__", type(trainer).__name__)
     )

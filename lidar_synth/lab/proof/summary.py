@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidar_synth.geometry.arrays import Float64Array
-from lidar_synth.lab.proof.arms import BASE, GENERATOR_BUDGET, Row
+from lidar_synth.lab.proof.arms import BASE, CONSTANTS, GENERATOR_BUDGET, Row
 from lidar_synth.lab.proof.machine import command_line, machine
 from lidar_synth.lab.proof.plan import Pair, ProofPlan, count_scans
 from lidar_synth.lab.proof.scores import (
@@ -19,7 +19,6 @@ from lidar_synth.lab.proof.scores import (
     mean_group_iou,
 )
 from lidar_synth.lab.proof.trial import LOOKS, TrialOutcome
-from lidar_synth.lab.town.returns import CALIBRATED_ON
 
 Results = dict[Pair, dict[Row, TrialOutcome]]
 """{pair: {arm: outcome}} of the complete pairs."""
@@ -103,7 +102,7 @@ def summarise(
     ]
     for row in arms:
         budget = row["budget"].replace(GENERATOR_BUDGET, f"{GENERATOR_BUDGET}: {seen}")
-        first, once, rest = budget.partition(f" ({CALIBRATED_ON})")
+        first, once, rest = budget.partition(CONSTANTS)
         row["budget"] = first + once + rest.replace(once, "")
     sizes = {
         name: {"scans": len(part), "tested": len(plan.tested[name])}
