@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from streets import kitti, street
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from lidar_synth import Boxes, Scan
@@ -372,6 +373,10 @@ def test_options_of_the_other_task_are_refused(
     assert isinstance(result.exception, ConfigError)
     message = str(result.exception)
     assert option in message and "Did you mean" not in message
+    named = message.partition("options of segmentation: ")[2].split(", ")
+    params = get_command(app).commands["prove"].params  # type: ignore[attr-defined]
+    marked = [p.opts[0] for p in params if "(segmentation)" in getattr(p, "help", "")]
+    assert sorted(named) == sorted(marked)
 
 
 @pytest.mark.parametrize("task", ["segmentation", "detection"])

@@ -35,7 +35,7 @@ def prove(
     arm: Annotated[list[str] | None, Option(help=_ARMS)] = None,
     ratio: Annotated[
         list[float] | None,
-        Option(help="share of synthetic scans, repeatable [0.5]"),
+        Option(help="(segmentation) share of synthetic scans, repeatable [0.5]"),
     ] = None,
     iterations: Annotated[
         int | None,
@@ -59,7 +59,9 @@ def prove(
     ] = None,
     model: Annotated[
         str | None,
-        Option(help="of the arms with a generator: a name or a file [town]"),
+        Option(
+            help="(segmentation) model of the arms with a generator: a name or a file [town]"
+        ),
     ] = None,
     synthetic: Annotated[
         int | None,
@@ -68,16 +70,21 @@ def prove(
     classes: Annotated[
         str | None,
         Option(
-            help="pooled classes: semantic_kitti | pandaset | kitti360 | nuscenes [auto]"
+            help="(segmentation) pooled classes: semantic_kitti | pandaset | kitti360 | nuscenes "
+            "[auto]"
         ),
     ] = None,
     only: Annotated[
         list[str] | None,
-        Option(metavar="CLASS", help="mean IoU over this class, repeatable"),
+        Option(
+            metavar="CLASS", help="(segmentation) mean IoU over this class, repeatable"
+        ),
     ] = None,
     trainer: Annotated[
         str | None,
-        Option(help="your own trainer: a command with {job}, the mixture as YAML"),
+        Option(
+            help="(segmentation) your own trainer: a command with {job}, the mixture as YAML"
+        ),
     ] = None,
     sensor: Annotated[
         str | None, Option(help="sensor of the scans: a preset or a YAML file")
@@ -86,19 +93,19 @@ def prove(
         int | None,
         Option(
             metavar="N",
-            help="evenly spaced beams that all scans keep, such as 32 [all]",
+            help="(segmentation) evenly spaced beams that all scans keep, such as 32 [all]",
         ),
     ] = None,
     tests: Annotated[
         Path | None,
-        Option(help="labelled scans of other places to test on"),
+        Option(help="(segmentation) labelled scans of other places to test on"),
     ] = None,
     pools: Annotated[
         Path | None,
         Option(help="folder of the synthetic scans, to share between runs"),
     ] = None,
     jobs: Annotated[
-        int | None, Option(min=1, help="processes [one for each core]")
+        int | None, Option(min=1, help="(segmentation) processes [one for each core]")
     ] = None,
     task: Annotated[
         str,
@@ -152,7 +159,7 @@ def prove(
             "ratio": ratio or None,
             "only": only or None,
         }
-        _check_task(task, drop_missing(own | more))
+        _check_task(task, own | more)
         source = open_scans(root, sensor=sensor, **given)
         _prove_detection(
             source,
@@ -195,14 +202,14 @@ def prove(
     echo(f"{proof}\n\nThe page is {(out / 'index.html').resolve()}")
 
 
-def _check_task(task: str, further: dict[str, Any]) -> None:
+def _check_task(task: str, of_segmentation: dict[str, Any]) -> None:
     from lidar_synth.errors import ConfigError, choose
 
     choose("--task", task, dict.fromkeys(("segmentation", "detection")))
-    if further:
+    if given := drop_missing(of_segmentation):
         raise ConfigError(
-            f"--task {task} with --{', --'.join(further)}",
-            "--task detection without options of segmentation",
+            f"--task {task} with --{', --'.join(given)}",
+            f"none of the options of segmentation: --{', --'.join(of_segmentation)}",
         )
 
 
@@ -223,5 +230,4 @@ def _prove_detection(
         echo(describe(work))
         return
     values = prove_detection(source, out, settings, **options)
-    page = (out / "index.html").resolve()
-    echo(f"{format_table(values)}\n\nThe page is {page}")
+    echo(f"{format_table(values)}\n\nThe page is {(out / 'index.html').resolve()}")
