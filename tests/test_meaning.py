@@ -241,6 +241,7 @@ def test_check_mix_shows_both_and_names_mistakes(tmp_path: Path) -> None:
         "ground, m",
         "reflectance: 1, 50, 99 %",
         "8 road",
+        " m high  ",
     ):
         assert line in done.output
     trained = settings.read_text()

@@ -122,7 +122,7 @@ def _print(real: "Meaning", synthetic: "Meaning", *rows: int) -> None:
         cells = [
             "-"
             if k is None
-            else f"{k.share:.1%}  {k.height:.1f} m  {k.range:.0f} m away"
+            else f"{k.share:.1%}  {k.height:.1f} m high  {k.range:.0f} m away"
             for k in looks
         ]
         lines.append((f"{value} {name}", cells))
