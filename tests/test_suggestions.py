@@ -241,6 +241,14 @@ def test_examples_of_commands_keep_their_lines() -> None:
         assert not re.search(r"(?<!\x08\n)Examples?:", command.help or ""), name
 
 
+def test_arguments_of_commands_are_shown_by_a_name_of_their_own() -> None:
+    group = get_command(app)
+    assert isinstance(group, TyperGroup)
+    for name, command in group.commands.items():
+        given = [p for p in command.params if p.param_type_name == "argument"]
+        assert all(getattr(param, "metavar", None) for param in given), name
+
+
 def test_a_name_like_none_has_no_suggestion() -> None:
     assert suggest("velodyne", ["kitti", "pcd"]) == ""
 

@@ -101,7 +101,7 @@ def insert_object(
     sensor: InputSensor = None,
     **reading: Any,
 ) -> None:
-    """Sets an object of a bank into one scan, with its box and with occlusion.
+    """Inserts an object of a bank into one scan, with its box and occlusion.
 
     \b
     Example:

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 def view(
     path: Annotated[
         str,
-        Argument(help="file, folder, root of a dataset, or bank, also its URL"),
+        Argument(
+            metavar="PATH",
+            help="file, folder, root of a dataset, or bank, also its URL",
+        ),
     ],
     index: Annotated[
         int, Option(help="number of the first scan, from 0; -1 is the last one")

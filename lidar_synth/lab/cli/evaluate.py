@@ -98,8 +98,8 @@ def evaluate(
     as_json: Json = False,
     **reading: Any,
 ) -> None:
-    """Compares two sets of scans: Jensen-Shannon distance and MMD of bird's-eye views; distances of
-    features where the published weights are at hand; general: ranges and classes; spiral: classes.
+    """Compares two sets of scans by a protocol: bird's-eye views (JSD, MMD), features where the
+    published weights are at hand, ranges or classes.
 
     With --judge, a segmentation network that was trained on real streets predicts the classes of
     both sets: accuracy, IoU by class, the most frequent confusions and feature distances.

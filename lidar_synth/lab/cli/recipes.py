@@ -43,8 +43,7 @@ def recipes(
         Option(help="print the JSON schema of: bake | distill | model | train"),
     ] = None,
 ) -> None:
-    """Lists the recipes and the models of several stages of the package with data, size and
-    expected time of each.
+    """Lists recipes and multi-stage models with their data, size and expected time.
 
     \b
     Examples:

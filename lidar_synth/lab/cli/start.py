@@ -42,12 +42,15 @@ def start(
     ] = None,
     dry_run: Annotated[
         bool,
-        Option("--dry-run", help="say what lies there, the minutes and the disk"),
+        Option(
+            "--dry-run",
+            help="print what was found, and the time and disk space needed",
+        ),
     ] = False,
     **reading: Any,
 ) -> None:
     """Begins with your scans: finds layout, labels, boxes and sensor, makes synthetic scans,
-    compares trainings with and without them, and prints the code and the configuration of yours.
+    compares trainings with and without them, and prints code and configuration for your trainer.
 
     Run it again to resume.
 
