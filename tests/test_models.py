@@ -57,6 +57,14 @@ SURFACES = {
 CODEC = "codec: {recipe: codec.yaml, minutes: 1}\n"
 
 
+def test_a_folder_with_the_name_of_a_recipe_does_not_hide_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("town_teacher").mkdir()  # such as its run
+    assert find_recipe("town_teacher").is_file()
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_a_published_model_plans_the_recipes_of_its_file(name: str) -> None:
     settings = load_model(find_model_file(name) or Path())

@@ -58,7 +58,7 @@ def find_recipe(given: str | Path) -> Path:
         ConfigError: on a name that no published recipe has.
     """
     path = Path(given)
-    if path.suffix in SUFFIXES or path.exists():
+    if path.suffix in SUFFIXES or path.is_file():
         return path
     published = folder() / f"{given}.yaml"
     if path.name != str(given) or not published.is_file():
