@@ -100,7 +100,7 @@ def instances_of(scan: Scan, least: int = 5) -> list[Object]:
     ordered = things[np.argsort(which, kind="stable")]
     for part in np.split(ordered, np.cumsum(np.bincount(which)))[1:]:
         if len(part) >= least:
-            box = _enclose(scan.points[part])
+            box = enclose(scan.points[part])
             objects.append(_object(scan, part, Boxes(box, ("Misc",))))
     return objects
 
@@ -120,7 +120,7 @@ def number_instances(scan: Scan) -> NDArray[np.int32]:
     return numbers
 
 
-def _enclose(points: NDArray[np.float32]) -> NDArray[np.float32]:
+def enclose(points: NDArray[np.float32]) -> NDArray[np.float32]:
     """The box of yaw 0 around points, as of ``Boxes``."""
     low = points.min(0)
     high = points.max(0)

@@ -50,12 +50,11 @@ def views(given: Sequence[Scan | RangeImage]) -> list[View]:
         raise ConfigError("no scans to show", "at least one scan")
     result = []
     for item in given:
-        if isinstance(item, Scan):
-            require_finite(item)
-            require_reflectance(item)
         if item.label is not None:
             check_labels(item.label, f"scan {getattr(item, 'id', '')!r}")
         if isinstance(item, Scan):
+            require_finite(item)
+            require_reflectance(item)
             channels = [name for name in CHANNELS if name in item.fields()]
             result.append(View(item, project(item, channels=channels)))
         else:

@@ -60,15 +60,7 @@ def sheet(
         bottom=0.01,
         top=1 - 0.75 / (sum(heights) + 0.7),
     )
-    figure.text(
-        0.045,
-        1 - 0.28 / figure.get_figheight(),
-        caption(view.scan),
-        color=INK,
-        fontsize=15,
-        va="center",
-        parse_math=False,
-    )
+    _write_head(figure, caption(view.scan), 0.045, 1 - 0.28 / figure.get_figheight())
     _perspective(figure.add_subplot(grid[0, 0]), view, by, colours[by], camera)
     _from_above(figure.add_subplot(grid[0, 1]), view, colours["height"], extent)
     for row, channel in enumerate(view.channels, 1):
@@ -281,18 +273,8 @@ def _image(axes: Any, view: View, channel: str, scale: Scale) -> None:
         extent=(-180, 180, sensor.shape[0], 0),
     )
     style_axes(axes, scale.title, "", "row")
-    names = [
-        "behind",
-        "-135°",
-        "left",
-        "-45°",
-        "ahead",
-        "45°",
-        "right",
-        "135°",
-        "behind",
-    ]
-    axes.set_xticks(range(-180, 181, 45), names)
+    names = "behind -135° left -45° ahead 45° right 135° behind"
+    axes.set_xticks(range(-180, 181, 45), names.split())
     if not scale.classes:
         _colour_bar(axes, scale)
 

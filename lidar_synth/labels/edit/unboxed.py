@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import BOXED, GROUND, NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Boxes, Scan
-from lidar_synth.labels.boxes import grow_box
 from lidar_synth.labels.edit.redraw import Model
 from lidar_synth.labels.edit.removal import remove_returns
 from lidar_synth.labels.ground import FLOOR, standing
+from lidar_synth.labels.objects import enclose
 
 LEAST = 20
 """Minimum number of points of an unboxed object; smaller ones are too small for a detector, too."""
@@ -188,12 +188,7 @@ def _with_rim(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """The returns of a cluster with those at its rim that have another label, and the box (7,)
     around it."""
-    low = scan.points[mine].min(0)
-    high = scan.points[mine].max(0)
-    box = grow_box(
-        np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32),
-        scan.points[mine],
-    )
+    box = enclose(scan.points[mine])
     around = Boxes(box, ("Misc",)).contain(scan.points, above_floor=FLOOR)[0]
     if scan.label is not None:
         around &= ~GROUND[scan.label]
