@@ -125,7 +125,7 @@ def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-d
     if labelled and not ground.any():
         labelled = is_ground[labels].any()  # as ``has_ground``
     if not labelled:
-        lowest = _third_lowest(local)
+        lowest = _lowest(local)
         for k in range(len(near)):
             ground[k] = local[k, 2] < lowest + _STACK
     total = ground.sum()
@@ -175,20 +175,12 @@ def _around(points, box, reach):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _third_lowest(local):  # type: ignore[no-untyped-def]
-    """The third lowest height, because up to two stray returns may lie below the ground."""
-    first = np.inf
-    second = np.inf
-    third = np.inf
-    for k in range(len(local)):
-        z = local[k, 2]
-        if z < first:
-            first, second, third = z, first, second
-        elif z < second:
-            second, third = z, second
-        elif z < third:
-            third = z
-    return third
+def _lowest(local):  # type: ignore[no-untyped-def]
+    """The height that 5 % of the returns lie below, and at least two: stray ones and those that a
+    mirror shows under the ground."""
+    if len(local) < LEAST:
+        return np.inf
+    return np.sort(local[:, 2])[max(2, len(local) // 20)]
 
 
 @_compiled
