@@ -1,14 +1,15 @@
-"""The ground under an object in a scan without labels, where the lowest returns tell it."""
+"""The ground under an object in a scan without labels, where the lowest returns tell it, and the
+edges of a scan that was cropped."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from box_scenes import HEIGHT, car, cast
+from box_scenes import CAR, HEIGHT, car, cast
 
 from lidar_synth import open_scans
 from lidar_synth.geometry import Boxes, Scan
-from lidar_synth.labels import objects_of
+from lidar_synth.labels import edit, objects_of
 from lidar_synth.labels.ground import ground_under
 
 
@@ -37,3 +38,25 @@ def test_cars_of_unlabelled_recordings_stand_on_their_ground(
         if (ground := ground_under(scan, box)) is not None
     ]
     assert len(off) == 54 and np.abs(off).max() < 0.3
+
+
+def test_a_car_without_ground_around_it_stands_on_the_floor_of_its_box() -> None:
+    full = cast([car(6, -2)])
+    scan = bare(full[(full.label == CAR) & (full.points[:, 2] > 0.8 - HEIGHT)])
+    low = ground_under(scan, scan.boxes.values[0])
+    assert low is not None and low.height > 0.7 - HEIGHT
+    [item] = objects_of(scan).values()
+    assert abs(item.ground + HEIGHT) < 0.01
+    assert not len(edit.remove(scan, 0))
+
+
+def direction(scan: Scan) -> np.ndarray:
+    """(N,) degrees counter-clockwise from straight ahead."""
+    return np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+
+
+def test_nothing_is_drawn_beside_a_cropped_scan() -> None:
+    full = cast([car(3, -2.5)])
+    scan = bare(full[np.abs(direction(full)) < 40])
+    result = edit.remove(scan, 0)
+    assert np.abs(direction(result)).max() < 41

@@ -7,7 +7,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND, IGNORE
+from lidar_synth.datasets.classes import GROUND, IGNORE, has_ground
 from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.labels.boxes import box_frame
 
@@ -23,6 +23,9 @@ STEEP = 0.2
 FLOOR = 0.25
 """Height above the ground, metres, below which a return counts as ground and neither blocks nor
 hides an object."""
+OFF = 0.5
+"""Maximum distance, metres, of the floor of a recorded box from ground that has no labels; beyond,
+the lowest returns are the object's own."""
 CLEARANCE = 0.2
 """Minimum distance between an object and its surroundings, metres."""
 # height above the lowest return, metres, below which returns count as ground if there are no labels
@@ -95,6 +98,16 @@ def ground_under(scan: Scan, box: NDArray[np.float32]) -> Ground | None:
     if not known or np.hypot(along, across) > STEEP:
         return None
     return Ground(height, along, across, sides == _SIDES, free)
+
+
+def ground_of(scan: Scan, box: NDArray[np.float32]) -> Ground | None:
+    """``ground_under`` a recorded box (7,); without labels it is level with the box's floor if no
+    ground is near."""
+    ground = ground_under(scan, box)
+    floor = float(box[2] - box[5] / 2)
+    if ground is None or has_ground(scan.label) or abs(ground.height - floor) <= OFF:
+        return ground
+    return Ground(floor, 0.0, 0.0, False, False)
 
 
 def standing(scan: Scan, boxes: Boxes) -> NDArray[np.bool_]:

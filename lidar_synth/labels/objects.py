@@ -11,7 +11,7 @@ from lidar_synth.datasets.classes import GROUND, IGNORE, LABELS, TRAIN_ID
 from lidar_synth.errors import DataError
 from lidar_synth.geometry import Boxes, Scan, Sensor
 from lidar_synth.labels.boxes import grow_box, turn_boxes, turn_points
-from lidar_synth.labels.ground import ground_under
+from lidar_synth.labels.ground import ground_of
 
 THINGS = TRAIN_ID["road"]
 """Train ids below this one have instances."""
@@ -169,7 +169,7 @@ def _cut(scan: Scan, box: Boxes) -> Object | None:
 def _standing(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     """(N,) True for the points in a box that are above the ground."""
     inside: NDArray[np.bool_] = box.contain(scan.points)[0]
-    ground = ground_under(scan, box.values[0])
+    ground = ground_of(scan, box.values[0])
     if ground is not None:
         inside[inside] = ground.above(scan.points[inside], box.values[0]) > LOWEST
     return inside if scan.label is None else inside & ~GROUND[scan.label]
@@ -178,7 +178,7 @@ def _standing(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
 def _object(scan: Scan, mine: NDArray[np.intp], box: Boxes) -> Object:
     """The object of some returns (n,) of a scan, with its one box."""
     [values] = box.values
-    ground = ground_under(scan, values)
+    ground = ground_of(scan, values)
     label = LABELS.get(box.names[0], IGNORE)
     part = Scan(
         scan.points[mine],

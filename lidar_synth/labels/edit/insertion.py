@@ -139,7 +139,7 @@ def _set(
     rays = rays_of_scan(scan)
     window = np.flatnonzero(rays.through(placed.box, margin=0.3))
     rho, hits, at = _hits(item, placed, rays, window)
-    replaceable = (rays.point[window] >= 0) & estimated[rays.point[window]]
+    replaceable = rays.hitting(estimated)[window]
     seen = np.isfinite(rho) & (replaceable | (rho < rays.rho[window] - GRAZE))
     if seen.sum() < least:
         raise DataError(

@@ -44,6 +44,10 @@ class ScanRays(NamedTuple):
             np.float32
         )
 
+    def hitting(self, some: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(E,) whether the return of each ray is one of some of the N."""
+        return np.asarray((self.point >= 0) & some[self.point])
+
     def through(self, box: NDArray[np.float32], margin: float) -> NDArray[np.bool_]:
         """(E,) whether each ray passes through a box (7,) with a margin in metres on all six
         sides."""

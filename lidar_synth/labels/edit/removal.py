@@ -20,7 +20,7 @@ from lidar_synth.labels.edit.compose import replace_returns
 from lidar_synth.labels.edit.fill import continue_surfaces
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
 from lidar_synth.labels.edit.redraw import Model, open_model, redraw_hole
-from lidar_synth.labels.ground import CLEARANCE, FLOOR, ground_under, standing
+from lidar_synth.labels.ground import CLEARANCE, FLOOR, ground_of, standing
 from lidar_synth.labels.objects import NOISE, THINGS, find_returns
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     outside."""
     mine = find_returns(scan, box)
     around = box.enlarged(NOISE).contain(scan.points)[0] & ~mine
-    ground = ground_under(scan, box.values[0])
+    ground = ground_of(scan, box.values[0])
     if ground is not None:
         around[around] = ground.above(scan.points[around], box.values[0]) > FLOOR
     else:
@@ -180,14 +180,17 @@ def remove_returns(
     if not removed.any():
         return scan
     rays = rays_of_scan(scan)
-    returned = rays.point >= 0
-    hole = returned & removed[rays.point]
+    hole = rays.hitting(removed)
     near = np.full(len(hole), np.inf)
     far = np.zeros(len(hole))
+    # In a direction without a return of any ring nothing was recorded, as after a crop to the
+    # camera's view.
+    degree = np.rint(np.degrees(rays.azimuth)).astype(np.int64) % 360
+    silent = (rays.point < 0) & np.isin(degree, degree[rays.point >= 0])
     near[hole] = rays.rho[hole]
     for mine, box in parts:
         if mine.any():
-            absorbed = ~returned & rays.through(box, MARGIN)
+            absorbed = silent & rays.through(box, MARGIN)
             near[absorbed] = np.minimum(
                 near[absorbed], np.hypot(*scan.points[mine, :2].T).min()
             )
@@ -208,14 +211,10 @@ def remove_returns(
 def _ground(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:
     """(E,) True for returns of the ground: by their labels, or, without labels of the ground, by
     their height."""
-    ground = np.zeros(len(rays.point), bool)
-    returned = rays.point >= 0
     if has_ground(scan.label):
-        ground[returned] = GROUND[scan.label[rays.point[returned]]]
-    else:
-        low = np.percentile(scan.points[:, 2], 10) + 0.5 if len(scan) else 0.0
-        ground[returned] = scan.points[rays.point[returned], 2] < low
-    return ground
+        return rays.hitting(GROUND[scan.label])
+    height = scan.points[:, 2]
+    return rays.hitting(height < np.percentile(height, 10) + 0.5)
 
 
 def _things(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:
@@ -225,7 +224,7 @@ def _things(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:
         thing |= scan.label < THINGS
     if scan.boxes is not None:
         thing |= standing(scan, scan.boxes).any(0)
-    return np.asarray((rays.point >= 0) & thing[rays.point])
+    return rays.hitting(thing)
 
 
 def _copies(
