@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lidar_synth.datasets.classes import IGNORE, LABELS, TRAIN_ID
 from lidar_synth.generate.models.surface_codec.blocks import to_patches
-from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES
+from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES, DEPTH_STEP
 from lidar_synth.geometry.layout.raster import depths_of
 from lidar_synth.geometry.normalize import Normalisation
 
@@ -52,14 +52,15 @@ def bounds_of(
         normalisation: of the ranges.
     """
     code = layout[:, 0]
-    depth = depths_of(layout)
-    chord = layout[:, 3] * CHORD_STEP
+    # Images round to the nearest step: at worst, a ray enters and leaves half a step further in.
+    depth = depths_of(layout) + DEPTH_STEP
+    chord = (layout[:, 3] - 0.5) * CHORD_STEP - 2 * DEPTH_STEP
     boxed = code >= CODES["Car"]
     blank = (code == 0).all(2).all(1)[:, None, None]
     near = torch.where(boxed, normalisation.encode(depth), 1.0).masked_fill(blank, -1.0)
-    far = torch.where(boxed, normalisation.encode(depth + chord), -1.0).masked_fill(
-        blank, 1.0
-    )
+    far = torch.where(
+        boxed, normalisation.encode(depth + chord.clamp(min=0)), -1.0
+    ).masked_fill(blank, 1.0)
     labels = torch.tensor(_LABELS, device=layout.device)[code.long()]
     shape = (*near.shape[:2], columns, -1)
     near, nearest = near.reshape(shape).min(3)
