@@ -9,10 +9,12 @@ from hypothesis import strategies as st
 
 from lidar_synth.geometry.overlap import overlapping_pairs
 from lidar_synth.geometry.scan import Boxes
+from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.town.bodies import PHASES, cyclist, motorcyclist, sitter, walker
 from lidar_synth.lab.town.bodywork import GLASS
 from lidar_synth.lab.town.boxes import box_values
 from lidar_synth.lab.town.course import Course, Relief
+from lidar_synth.lab.town.ego import free_rays
 from lidar_synth.lab.town.ground import KINDS, NAMES, TownGround
 from lidar_synth.lab.town.materials import MATERIALS, Finish, Finishes
 from lidar_synth.lab.town.meshes import (
@@ -311,6 +313,19 @@ def test_all_kinds_of_street_are_sampled() -> None:
         str(rng_for(WORLD, 0, k).choice(STREETS, p=SHARES)) for k in range(40)
     } == set(STREETS)
     assert sum(SHARES) == pytest.approx(1)
+
+
+def test_no_ray_passes_through_the_ego_vehicle() -> None:
+    x, y, _ = Town(7, "os0_128", 1, motion=False)[0].points.T
+    assert not ((np.abs(x) < 2.3) & (np.abs(y) < 0.9)).any()
+
+
+@pytest.mark.parametrize("name", ["town", "os1_128", "pandar64"])
+def test_lasers_alternate_between_two_sides_on_an_hdl64e_only(name: str) -> None:
+    """Its mounts block every other row at the edges of their two shadows."""
+    blocked = ~free_rays(load_sensor(name))
+    comb = blocked[:-2] & ~blocked[1:-1] & blocked[2:]
+    assert comb.any() == (name == "town")
 
 
 def test_movers_do_not_collide() -> None:

@@ -1,9 +1,9 @@
 """The ego vehicle: where the LiDAR is mounted on it, and which rays its own body blocks.
 
 The vehicle is an estate car with a roof rack. The LiDAR is mounted on the rack, 1.73 m above the
-road, between two upright camera mounts. Rays that hit the vehicle or its mounts return nothing in
-any scan. The lasers of an HDL-64E alternate between the left and the right side of its axis, so a
-nearby mount casts two blind spots.
+road, an HDL-64E between two upright camera mounts. Rays that hit the vehicle or the mounts return
+nothing in any scan. The lasers of an HDL-64E alternate between the left and the right side of its
+axis, so a nearby mount casts two blind spots.
 """
 
 from functools import lru_cache
@@ -32,18 +32,20 @@ def point_rays(azimuth: Float64Array, elevation: Float64Array) -> Float64Array:
 @lru_cache(maxsize=8)
 def free_rays(sensor: Sensor) -> NDArray[np.bool_]:
     """(H, F) which rays of a sensor's firings the ego vehicle does not block; read-only."""
+    hdl = bool(
+        sensor.heights
+    )  # only lasers of an HDL-64E start at heights of their own
     azimuth = sensor.firing_azimuths()
     elevation, height = (
         np.broadcast_to(v[:, None], azimuth.shape) for v in sensor.optics()
     )
     rays = point_rays(azimuth, elevation)
-    odd = np.arange(len(azimuth))[:, None] % 2
-    side = np.where(odd, _LASER_OFFSET, -_LASER_OFFSET)
+    side = np.resize([-_LASER_OFFSET, _LASER_OFFSET], len(azimuth))[:, None] * hdl
     start = np.stack([side * np.sin(azimuth), side * np.cos(azimuth), height], -1)
-    distance, _, _ = Solid(assemble("ego_vehicle").triangles).first(
-        start.reshape(-1, 3).astype(np.float32),
-        rays.reshape(-1, 3).astype(np.float32),
-    )
+    body = [assemble(n).triangles for n in ("ego_vehicle", "camera_mounts")[: 1 + hdl]]
+    distance = Solid(np.concatenate(body)).first(
+        *(v.reshape(-1, 3).astype(np.float32) for v in (start, rays))
+    )[0]
     free = np.isinf(distance).reshape(azimuth.shape)
     free.setflags(write=False)
     return free
