@@ -344,6 +344,20 @@ def test_a_contact_sheet_shows_every_scan() -> None:
         contact_sheet([])
 
 
+def test_captions_of_tiles_are_short_and_name_augmentations() -> None:
+    """A caption is no wider than its tile, and long ids differ at both ends."""
+    scan = replace(random_scan(SMALL, 50, 0), label=None)
+    long = replace(scan, id=f"n015-2018{'0' * 60}651")
+    figure = contact_sheet([long, replace(scan, id="few").noted("fog", visibility=30)])
+    figure.canvas.draw()
+    tiles = [axes for axes in figure.axes if axes.get_title(loc="left")]
+    text, fog = (axes.get_title(loc="left") for axes in tiles)
+    assert text.startswith("n015-2018") and text.endswith("651  ·  real")
+    assert fog == "few  ·  real  ·  fog"
+    for axes in tiles:
+        assert axes.get_tightbbox().width <= axes.get_window_extent().width + 1
+
+
 def test_a_camera_straight_above_shows_ahead_up() -> None:
     scan = random_scan(SMALL)
     above = Camera((0.0, 0.0, 50.0))

@@ -138,9 +138,7 @@ def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-d
     if labelled and not ground.any():
         labelled = is_ground[labels].any()  # as ``has_ground``
     if not labelled:
-        lowest = _lowest(local)
-        for k in range(len(near)):
-            ground[k] = local[k, 2] < lowest + _STACK
+        ground = local[:, 2] < _lowest(local) + _STACK
     total = ground.sum()
     along, across, height = _plane(local, ground, box)
     # Without labels the first plane lies slightly too high, because it includes the lowest returns
@@ -224,12 +222,12 @@ def _plane(local, ground, box):  # type: ignore[no-untyped-def]
             gap = max(abs(local[k, 0]) - box[3] / 2, abs(local[k, 1]) - box[4] / 2, 0.0)
             weight[k] = 1 / (1 + gap * gap)
             total += weight[k]
-            x = x + weight[k] * local[k, 0]
-            y = y + weight[k] * local[k, 1]
-            z = z + weight[k] * local[k, 2]
-    x = x / total
-    y = y / total
-    z = z / total
+            x += weight[k] * local[k, 0]
+            y += weight[k] * local[k, 1]
+            z += weight[k] * local[k, 2]
+    x /= total
+    y /= total
+    z /= total
     xx = 1.0
     xy = 0.0
     yy = 1.0
@@ -239,11 +237,11 @@ def _plane(local, ground, box):  # type: ignore[no-untyped-def]
         u = local[k, 0] - x
         v = local[k, 1] - y
         w = local[k, 2] - z
-        xx = xx + weight[k] * u * u
-        xy = xy + weight[k] * u * v
-        yy = yy + weight[k] * v * v
-        xz = xz + weight[k] * u * w
-        yz = yz + weight[k] * v * w
+        xx += weight[k] * u * u
+        xy += weight[k] * u * v
+        yy += weight[k] * v * v
+        xz += weight[k] * u * w
+        yz += weight[k] * v * w
     scale = xx * yy - xy * xy
     along = (xz * yy - yz * xy) / scale
     across = (yz * xx - xz * xy) / scale

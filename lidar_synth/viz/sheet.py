@@ -47,7 +47,8 @@ def sheet(
     by = "label" if view.scan.label is not None else "height"
     legend = 0.5 if by == "label" else 0.1
     heights = [6.2, *[1.45] * len(view.channels), legend]
-    figure = new_figure(17.0, sum(heights) + 0.7)
+    height = sum(heights) + 0.7
+    figure = new_figure(17.0, height)
     grid = figure.add_gridspec(
         len(heights),
         2,
@@ -58,9 +59,9 @@ def sheet(
         left=0.045,
         right=0.945,
         bottom=0.01,
-        top=1 - 0.75 / (sum(heights) + 0.7),
+        top=1 - 0.75 / height,
     )
-    _write_head(figure, caption(view.scan), 0.045, 1 - 0.28 / figure.get_figheight())
+    _write_head(figure, caption(view.scan), 0.045, 1 - 0.28 / height)
     _perspective(figure.add_subplot(grid[0, 0]), view, by, colours[by], camera)
     _from_above(figure.add_subplot(grid[0, 1]), view, colours["height"], extent)
     for row, channel in enumerate(view.channels, 1):
@@ -122,9 +123,7 @@ def contact_sheet(
         tile = grid[place].subgridspec(
             1 + len(strips), 1, height_ratios=[5, *[1] * len(strips)], hspace=0.02
         )
-        above, *below = (
-            figure.add_subplot(tile[row]) for row in range(1 + len(strips))
-        )
+        above, *below = tile.subplots()
         _show_pixels(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
         for axes, channel in zip(below, strips, strict=True):
             _show_pixels(axes, picture(view.image, channel, colours[channel]))
@@ -190,10 +189,15 @@ def histograms(
 
 
 def caption(scan: Scan, short: bool = False) -> str:
-    """A caption for a scan: id, sensor, domain, number of points; ``short``: id and domain."""
+    """A caption for a scan: id, sensor, domain, number of points; ``short``: id, domain and
+    augmentations, in at most 55 characters."""
     domain = list(DOMAINS)[scan.domain]
     if short:
-        return f"{scan.id or 'scan'}  ·  {domain}"
+        augmented = [name for step in scan.augmented for name in step]
+        text = "  ·  ".join([scan.id or "scan", domain, *augmented])
+        if len(text) > 55:
+            text = f"{text[:26]}…{text[-28:]}"
+        return text
     return f"{scan.id or 'scan'}   ·   {scan.sensor.name}   ·   {domain}   ·   {len(scan):,} points"
 
 

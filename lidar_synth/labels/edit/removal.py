@@ -105,7 +105,7 @@ def select_boxes(scan: Scan, box: Which) -> tuple[Boxes, list[int] | None]:
     if given.dtype.kind in "iu" and given.ndim < 2:
         numbers = np.atleast_1d(given).tolist()
         count = 0 if scan.boxes is None else len(scan.boxes)
-        if scan.boxes is None or min(numbers) < 0 or max(numbers) >= count:
+        if scan.boxes is None or not set(numbers) <= set(range(count)):
             given_text = f"box {given.tolist()} of scan {scan.id!r} with {count} boxes"
             raise DataError(
                 given_text,
