@@ -123,7 +123,8 @@ def contact_sheet(
         tile = grid[place].subgridspec(
             1 + len(strips), 1, height_ratios=[5, *[1] * len(strips)], hspace=0.02
         )
-        above, *below = tile.subplots()
+        panels: Any = tile.subplots()
+        above, *below = panels
         _show_pixels(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
         for axes, channel in zip(below, strips, strict=True):
             _show_pixels(axes, picture(view.image, channel, colours[channel]))
