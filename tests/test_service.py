@@ -22,7 +22,7 @@ from lidar_synth.errors import ConfigError, DataError, FileError, ProcessError
 from lidar_synth.generate.generator import Generator
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
+from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.mixing import MixedScans, Sources
 from lidar_synth.mixing.service import BatchMixer, RollingBank
 from lidar_synth.mixing.service.slots import Slots
@@ -108,11 +108,6 @@ def test_a_rolling_bank_gives_the_generators_scans_in_every_order(
             SENSOR,
         )
         assert agree(codes(scan), expected(generator, number))
-        image = Encoding(SENSOR, FIELDS).encode(bank.image(number))
-        assert all(
-            (image[name] == values).mean() >= 0.9999
-            for name, values in expected(generator, number).items()
-        )
 
 
 class Codes(Dataset[Any]):
@@ -381,8 +376,3 @@ def test_a_loop_that_is_left_early_leaves_no_thread(generator: Generator) -> Non
     for _ in mixer:
         break
     wait_until(lambda: threading.active_count() <= before)
-
-
-def test_an_image_is_what_its_scan_shows(bank: RollingBank) -> None:
-    image: RangeImage = bank.image(4)
-    assert np.array_equal(image.mask, project(bank[4]).mask)

@@ -23,7 +23,7 @@ from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model, load_generator
-from lidar_synth.geometry import SYNTHETIC, RangeImage, Scan, model_provenance
+from lidar_synth.geometry import SYNTHETIC, Scan, model_provenance
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.labels.own import check_count
 from lidar_synth.mixing.service.client import Client
@@ -163,10 +163,6 @@ class RollingBank:
             domain=SYNTHETIC,
             provenance=self._provenance,
         )
-
-    def image(self, number: int) -> RangeImage:
-        """The range image of the scan at ``number``; raises as ``bank[number]``."""
-        return self._slots.encoding.decode(self.read(number)[1])
 
     def read(self, number: int) -> tuple[int, dict[str, NDArray[Any]]]:
         """The number of the scan that serves a request, and its encoded arrays; raises as
