@@ -16,24 +16,25 @@ from lidar_synth.mixing.schedules import Schedule, make_schedule, share_of
 Forward = Callable[[nn.Module, Any], Any]
 
 
-def make_weight(weight: Any) -> Schedule:
+def make_weight(weight: Any, epoch: int = 0) -> Schedule:
     """The weight of synthetic samples in the loss, by epoch.
 
     Args:
         weight: a number from 0 to 1, or one by epoch in any form of ``make_schedule``.
+        epoch: an epoch that needs a weight.
 
     Raises:
-        ConfigError: on anything else.
+        ConfigError: on anything else, or without a weight for the epoch.
     """
     try:
         schedule = make_schedule(weight)
-        share_of(schedule, 0)
+        share_of(schedule, epoch)
         return schedule
     except ConfigError as error:
         raise ConfigError(
-            f"loss_weight={weight!r}",
+            f"loss_weight={weight!r} in epoch {epoch}",
             "the weight of synthetic samples in the loss, from 0 to 1, or one by epoch, such as "
-            "{0: 1.0, 10: 0.1}",
+            "{0: 1.0, 10: 0.1}, whose last one stays",
         ) from error
 
 

@@ -343,13 +343,7 @@ class MixedScans(Dataset[Any]):
             ConfigError: on an epoch for which there is no ratio or no weight.
         """
         MixingPlan(self.mixture, epoch)
-        try:
-            share_of(self.synthetic_weight, epoch)
-        except ConfigError as error:
-            raise ConfigError(
-                f"loss_weight= that gives no weight from 0 to 1 in epoch {epoch}",
-                "one for every epoch, or {epoch: weight}, whose last weight stays",
-            ) from error
+        make_weight(self.synthetic_weight, epoch)  # raises without one
         if self._continues:
             self._continues = False
             self.current.forget_pass()
