@@ -205,6 +205,16 @@ def test_all_epochs_have_one_length(ratio: object, size: str | int) -> None:
             assert size != "add" or counts[0] >= real
 
 
+LATE = {0: 0.1, 110: 0.8, 120: 0.1}
+
+
+@pytest.mark.parametrize("ratio", [LATE, [0.1] * 110 + [0.8] * 10 + [0.1]])
+def test_a_late_change_of_the_ratio_counts(ratio: object) -> None:
+    late = mixture(20, ratio, reuse=2)
+    assert count_samples(late, 112) == (20, 80)
+    assert late.laps == (80,)
+
+
 @settings(max_examples=60)
 @given(
     st.lists(st.fractions("1/20", 50, max_denominator=20), min_size=1, max_size=9),
@@ -527,6 +537,11 @@ def test_the_remaining_samples_do_not_depend_on_the_number_of_ranks() -> None:
             lambda: mixture(epoch_size="double"),
             ConfigError,
             r"epoch_size='double'; expected 'add', 'replace' or",
+        ),
+        (
+            lambda: mixture(ratio=LATE | {110: 1.0}),
+            ConfigError,
+            r"ratio 1 in epoch 110 .*epoch_size='add'",
         ),
         (lambda: mixture(epoch_size=0), ConfigError, r"epoch_size=0"),
         (lambda: mixture(reuse=0), ConfigError, r"reuse=0"),

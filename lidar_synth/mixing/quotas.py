@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.arrays import Int64Array
-from lidar_synth.mixing.schedules import Schedule, constant_from, share_of
+from lidar_synth.mixing.schedules import Schedule, Steps, constant_from, share_of
 
 EpochSize = Literal["add", "replace"] | int
 """The length of all epochs: ``"add"`` uses every real scan once and adds synthetic ones to reach
@@ -36,7 +36,7 @@ synthetic; a number is the length itself."""
 
 _FINEST = 2**30  # largest denominator of a source's share: products stay within 64 bits
 _LONGEST = 10**4200  # largest denominator of a sum: Python writes up to 4300 digits
-# Number of epochs of a changing schedule that determine lengths of epochs and laps.
+# Number of epochs of a function that determine lengths of epochs and laps.
 _FIRST_EPOCHS = 100
 
 
@@ -175,8 +175,10 @@ class Mixture:
 
     @cached_property
     def _deciding(self) -> tuple[int, ...]:
-        """The epochs that are checked and that determine lengths: all until the ratio is constant,
-        but at most the first hundred."""
+        """The epochs that are checked and that determine lengths: all in which the ratio changes;
+        of a function, the first hundred and that from which on it is constant."""
+        if isinstance(self.ratio, Steps):
+            return self.ratio.changes
         last = constant_from(self.ratio)
         epochs = [
             *range(_FIRST_EPOCHS if last is None else min(last, _FIRST_EPOCHS)),

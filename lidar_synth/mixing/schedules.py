@@ -5,9 +5,11 @@ attribute ``constant_from``, the epoch from which on the share is constant, so t
 can be counted without visiting every epoch.
 """
 
+from bisect import bisect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from operator import index
 from typing import Any
 
@@ -43,10 +45,15 @@ class Steps:
         for epoch, value in self.shares:
             _checked(value, epoch)
 
+    @cached_property
+    def changes(self) -> tuple[int, ...]:
+        """The epochs from which on each share holds."""
+        return tuple(epoch for epoch, _ in self.shares)
+
     @property
     def constant_from(self) -> int:
         """The epoch from which on the share is constant."""
-        return self.shares[-1][0]
+        return self.changes[-1]
 
     def __call__(self, epoch: int) -> float:
         if self.length is not None and epoch >= self.length:
@@ -55,7 +62,7 @@ class Steps:
                 "a ratio for every epoch",
                 "Make the list longer, or give {epoch: ratio}, whose last ratio holds for ever.",
             )
-        return next(value for first, value in reversed(self.shares) if first <= epoch)
+        return self.shares[bisect(self.changes, epoch) - 1][1]
 
 
 @dataclass(frozen=True)
