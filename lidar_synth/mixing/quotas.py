@@ -30,9 +30,10 @@ from lidar_synth.mixing.schedules import Schedule, Steps, constant_from, share_o
 
 EpochSize = Literal["add", "replace"] | int
 """The length of all epochs: ``"add"`` uses every real scan once and adds synthetic ones to reach
-the ratio, or the largest ratio of a schedule (where the ratio is smaller, real scans are used more
-often, all equally); ``"replace"`` has as many samples as there are real scans, some of them
-synthetic; a number is the length itself."""
+the ratio, or the largest ratio of a schedule; where the ratio is smaller, real scans are used more
+often, all equally over all epochs, so that a later epoch may use some twice and others never;
+``"replace"`` has as many samples as there are real scans, some of them synthetic; a number is the
+length itself."""
 
 _FINEST = 2**30  # largest denominator of a source's share: products stay within 64 bits
 _LONGEST = 10**4200  # largest denominator of a sum: Python writes up to 4300 digits

@@ -82,8 +82,9 @@ class MixedScans(Dataset[Any]):
         seed: of the order, of all random numbers of a sample, and of a generator's scans.
         epoch_size: the length of every epoch. ``"add"`` uses every real scan once and adds
             synthetic ones, as many as the largest ratio of a schedule needs; where the ratio is
-            smaller, real scans are used more often. ``"replace"`` has as many samples as there are
-            real scans; a number is the length.
+            smaller, real scans are used more often, all equally over all epochs, so that a later
+            epoch may use some twice and others never. ``"replace"`` has as many samples as there
+            are real scans; a number is the length.
         reuse: number of epochs in which each synthetic scan is used, with different random
             augmentations.
         balanced: whether to spread synthetic samples evenly, so that every batch in the order of
