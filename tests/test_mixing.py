@@ -154,6 +154,32 @@ def test_ranks_divide_an_epoch_without_duplicates_or_loss(
     mp.start_processes(gathered, (ranks, free_port), nprocs=ranks, start_method=method)
 
 
+def divided_late(rank: int, port: int) -> None:
+    """One rank: what is made, asked and resumed before the process group is divided after it."""
+    train = mixed()
+    load = train.loader(2, collate_fn=list)
+    stream = MixedStream(train, batch_size=2, endless=False)
+    assert (len(load), load.state_dict()["position"], stream.world_size) == (8, 0, 1)
+    load.load_state_dict(make_state(train.mixture, 1, 3))
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    dist.init_process_group("gloo", rank=rank, world_size=2)
+    try:
+        assert (len(load), stream.world_size) == (4, 2)
+        streamed = DataLoader(stream, 2, num_workers=1, collate_fn=list)
+        for loader, first in ((load, 3), (streamed, 0)):
+            expected = ids(train)[first:]
+            every: list[Any] = [None] * 2
+            seen = [item["id"] for batch in loader for item in batch]
+            dist.all_gather_object(every, seen)
+            assert sorted(every[0] + every[1]) == sorted(expected)
+    finally:
+        dist.destroy_process_group()
+
+
+def test_a_loader_made_before_the_process_group_loads_its_share(free_port: int) -> None:
+    mp.start_processes(divided_late, (free_port,), nprocs=2, start_method="fork")
+
+
 @pytest.fixture
 def free_port() -> int:
     import socket

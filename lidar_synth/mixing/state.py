@@ -32,7 +32,7 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
         ConfigError: on one without the other, or a rank out of range.
     """
     if rank is None and world_size is None:
-        if torch.distributed.is_available() and torch.distributed.is_initialized():
+        if _is_grouped():
             return torch.distributed.get_rank(), torch.distributed.get_world_size()
         launched = "RANK" in os.environ and "WORLD_SIZE" in os.environ
         if launched:
@@ -43,6 +43,11 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
             f"rank {rank} of {world_size}", "both, 0 <= rank < world_size"
         )
     return rank, world_size
+
+
+def _is_grouped() -> bool:
+    """Whether this process is in a process group of ``torch.distributed``."""
+    return torch.distributed.is_available() and torch.distributed.is_initialized()
 
 
 def count_accelerated() -> int:
@@ -56,20 +61,35 @@ def count_accelerated() -> int:
 class Divided:
     """Base class of batches and streams that are divided among ranks.
 
-    Default ranks are refused where an ``Accelerator`` may divide the batches among the same
-    processes a second time."""
+    Default ranks follow a process group that is made later. They are refused where an
+    ``Accelerator`` may divide the batches among the same processes a second time."""
 
     call: str
     """The call that makes the object, for error messages."""
-    rank: int
-    world_size: int
+    _divided: tuple[int, int]
     _default_rank: bool
 
     def divide(self, rank: int | None, world_size: int | None) -> None:
         """Change the rank of this process and the number of ranks, before iterating; arguments as
         of ``place``."""
-        self.rank, self.world_size = place(rank, world_size)
+        self._divided = place(rank, world_size)
         self._default_rank = rank is None
+
+    @property
+    def rank(self) -> int:
+        """The rank of this process."""
+        return self._current_place()[0]
+
+    @property
+    def world_size(self) -> int:
+        """The number of ranks."""
+        return self._current_place()[1]
+
+    def _current_place(self) -> tuple[int, int]:
+        # Spawned workers have no process group: they keep what the main process had.
+        if self._default_rank and _is_grouped():
+            self._divided = place(None, None)
+        return self._divided
 
     def _check(self) -> None:
         """Refuse default ranks.
