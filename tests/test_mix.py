@@ -15,6 +15,7 @@ from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing import Linear, MixedScans
+from lidar_synth.mixing.state import make_state
 
 THEIRS = Sensor("theirs", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 WORKERS = pytest.mark.parametrize(
@@ -114,6 +115,20 @@ def test_a_loader_resumes_after_the_latest_batch(
     assert ids(resumed) == (whole[len(seen) :] or in_order(3))
     assert resumed.epoch == (3 if done else 4)
     assert ids(resumed) == in_order(resumed.epoch - 1)
+
+
+@WORKERS
+@pytest.mark.parametrize("later", [(2,), (3, 2)])
+def test_a_resumed_epoch_that_comes_again_is_whole(
+    workers: int, later: tuple[int, ...]
+) -> None:
+    loader = mixture().loader(batch_size=4, num_workers=workers)
+    loader.load_state_dict(make_state(mixture().mixture, 2, 4))
+    assert ids(loader) == in_order(2)[4:]
+    for epoch in later:
+        loader.set_epoch(epoch)
+        assert ids(loader) == in_order(epoch)
+        assert loader.epoch == loader.state_dict()["epoch"] == epoch + 1
 
 
 def test_a_pass_that_is_left_early_is_begun_again() -> None:
