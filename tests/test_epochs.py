@@ -133,6 +133,36 @@ def test_a_slow_worker_starts_in_the_epoch_in_which_its_pass_began() -> None:
     refused(iterator, LATE)
 
 
+def test_a_worker_that_gets_its_first_sample_in_a_later_pass() -> None:
+    train = mixed(9)
+    both: Any = ConcatDataset([train, ["x"] * 2])
+    order = [[0, 1], [len(train), len(train) + 1]]  # a batch for each worker
+    loader = DataLoader(
+        both,
+        batch_sampler=order,
+        num_workers=2,
+        collate_fn=list,
+        persistent_workers=True,
+    )
+    assert samples(loader) == [*planned(train, 0)[:2], "x", "x"]
+    train.set_epoch(1)
+    order.reverse()
+    assert samples(loader) == ["x", "x", *planned(train, 1)[:2]]
+
+
+def test_workers_that_resume_at_the_end_of_an_epoch_begin_with_the_next() -> None:
+    kind = pytest.importorskip("torchdata.stateful_dataloader").StatefulDataLoader
+    options = {"num_workers": 2, "collate_fn": list, "persistent_workers": True}
+    train = mixed(9)
+    loader = kind(train, 4, **options)
+    states = [loader.state_dict() for _ in loader]
+    again = kind(train, 4, **options)
+    again.load_state_dict(states[-1])
+    assert samples(again) == []
+    train.set_epoch(1)
+    assert samples(again) == planned(train, 1)
+
+
 @pytest.mark.parametrize("persistent", [False, True])
 @pytest.mark.parametrize("workers", [0, 2])
 def test_batches_keep_the_epoch_in_which_iterating_began(

@@ -8,6 +8,7 @@ therefore raises an error.
 
 import os
 import sys
+import threading
 import warnings
 from types import FrameType
 from typing import Any
@@ -159,7 +160,8 @@ class CurrentEpoch:
             self._passes.clear()
         if fetcher not in self._passes:
             check_whole(fetcher.dataset)
-            self._passes[fetcher] = self.at_start if forked else epoch
+            first = forked and not _has_answered()
+            self._passes[fetcher] = self.at_start if first else epoch
             self.note_pass(self._passes[fetcher])
         check_pass(self._passes[fetcher], epoch)
         return epoch
@@ -243,6 +245,12 @@ def _is_mixed(dataset: Any) -> bool:
     if isinstance(dataset, ConcatDataset):
         return any(map(_is_mixed, dataset.datasets))
     return hasattr(dataset, "tell_sources")
+
+
+def _has_answered() -> bool:
+    """Whether this worker has sent something, after which another pass may have begun: its queue
+    has a thread since."""
+    return any(t.name == "QueueFeederThread" for t in threading.enumerate())
 
 
 def _running_fetcher() -> Any:
