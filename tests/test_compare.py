@@ -72,6 +72,11 @@ FORMS: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {
     },
     "tuple": lambda points, label: (points, label, "x"),
     "list": lambda points, label: [points, label],
+    "no box": lambda points, label: {
+        "points": points,
+        "corners": np.zeros((0, 8, 3), np.float32),
+        "label": label,
+    },
     "nested": lambda points, label: {
         "inputs": {"points": points},
         "data_samples": Sample(label, {"path": "x"}),

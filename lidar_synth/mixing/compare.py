@@ -372,10 +372,8 @@ def _may_be_labels(place: str) -> bool:
 
 def _rows(array: NDArray[Any]) -> NDArray[np.float64] | None:
     """(N, C) of points (N, C), features (C, N) or an image (C, H, W); None for any other array."""
-    if array.ndim == 3 and array.shape[0] <= MOST_COLUMNS:
+    if array.ndim in (2, 3) and 0 < len(array) <= MOST_COLUMNS:
         array = array.reshape(len(array), -1).T
-    elif array.ndim == 2 and array.shape[0] <= MOST_COLUMNS:
-        array = array.T
     fits = (
         array.ndim == 2
         and 0 < array.shape[1] <= MOST_COLUMNS
