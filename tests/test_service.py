@@ -26,6 +26,7 @@ from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.mixing import MixedScans, Sources
 from lidar_synth.mixing.service import BatchMixer, RollingBank
 from lidar_synth.mixing.service.slots import Slots
+from lidar_synth.mixing.state import make_state
 
 SEED = 3
 
@@ -362,12 +363,11 @@ def test_batch_mixing_takes_a_batch_sampler_and_several_sources(
     for position, (name, values) in zip(positions, given, strict=True):
         assert dataset[position][0] == name
         assert agree(values, dataset[position][1])
-    for options in ({}, {"batch_size": 2, "batch_sampler": dataset.batches(2)}):
-        with pytest.raises(
-            ConfigError,
-            match="batch_size=.* and batch_sampler=.*; expected one of them",
-        ):
-            BatchMixer(dataset, **options)
+    resumed = dataset.batches(4)
+    resumed.load_state_dict(make_state(dataset.mixture, 0, len(dataset)))
+    assert list(BatchMixer(dataset, batch_sampler=resumed)) == []
+    with pytest.raises(ConfigError, match="batch_size 0"):
+        BatchMixer(dataset, 0)
 
 
 def test_a_loop_that_is_left_early_leaves_no_thread(generator: Generator) -> None:
