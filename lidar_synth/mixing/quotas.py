@@ -181,13 +181,9 @@ class Mixture:
         if isinstance(self.ratio, Steps):
             return self.ratio.changes
         last = constant_from(self.ratio)
-        epochs = [
-            *range(_FIRST_EPOCHS if last is None else min(last, _FIRST_EPOCHS)),
-            last or 0,
-        ]
         planned = []
         with suppress(ConfigError):  # the schedule ends
-            for epoch in epochs:
+            for epoch in (*range(_FIRST_EPOCHS)[:last], last or 0):
                 share_of(self.ratio, epoch)
                 planned.append(epoch)
         return tuple(planned)

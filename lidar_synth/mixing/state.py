@@ -34,10 +34,9 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
     if rank is None and world_size is None:
         if _is_grouped():
             return torch.distributed.get_rank(), torch.distributed.get_world_size()
-        launched = "RANK" in os.environ and "WORLD_SIZE" in os.environ
-        if launched:
-            return (int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
-        return (0, 1)
+        if {"RANK", "WORLD_SIZE"} <= os.environ.keys():
+            return int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+        return 0, 1
     if rank is None or world_size is None or not 0 <= rank < world_size:
         raise ConfigError(
             f"rank {rank} of {world_size}", "both, 0 <= rank < world_size"
@@ -128,7 +127,7 @@ def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
     try:
         MixingPlan(mixture, epoch + 1)
     except ConfigError:
-        return epoch, len(MixingPlan(mixture, epoch))
+        return epoch, mixture.length
     return epoch + 1, 0
 
 
