@@ -206,7 +206,7 @@ def test_an_epoch_that_is_set_after_a_used_one_is_unused() -> None:
     from accelerate import Accelerator
 
     Accelerator(cpu=True)
-    current = CurrentEpoch()
+    current = CurrentEpoch(9)
     current.set(3)
     current.of(0)
     current.set(0)  # passes over a used epoch are counted from 0

@@ -385,6 +385,29 @@ def test_workers_say_that_an_epoch_comes_again(
     assert capfd.readouterr().err.count(AGAIN) == 1
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_pass_of_several_epochs_points_to_a_stream(
+    workers: int,
+    caught: list[warnings.WarningMessage],
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    train = mixed(20)
+    for epochs in (2, 3):
+        train.set_epoch(epochs)
+        sampler = RandomSampler(train, num_samples=epochs * len(train))
+        loader = DataLoader(
+            train,
+            4,
+            sampler=sampler,
+            num_workers=workers,
+            collate_fn=list,
+            worker_init_fn=show_warnings,
+        )
+        list(loader)
+        said = capfd.readouterr().err + "".join(str(w.message) for w in caught)
+        assert ("without set_epoch" in said) == (epochs == 3)
+
+
 @pytest.mark.parametrize("done", [0, 1])
 def test_resuming_in_an_epoch_is_no_repetition(
     done: int, caught: list[warnings.WarningMessage]

@@ -145,7 +145,6 @@ class MixedBatches(Divided, Sampler[list[int]]):
         self.divide(rank, world_size)
         self._start = (0, 0)  # epoch and position of the loaded state
         self._taken = (0, 0)  # epoch, and number of its batches taken so far
-        self._warned = False
         # Samples that the dataset fetched before the latest complete pass, and in that pass.
         self._fetched = (0, 0)
 
@@ -172,9 +171,8 @@ class MixedBatches(Divided, Sampler[list[int]]):
                 f"{len(steps[-1])} samples left for {self.world_size} ranks: some get none",
                 stacklevel=2,
             )
-        if again and not self._warned:
-            self._warned = True
-            warnings.warn(REPEATED.format(epoch), stacklevel=2)
+        if again:
+            self.dataset.current.warn(REPEATED.format(epoch))
         before, yielded = self._fetched
         fetched = self.dataset.current.fetched - before
         if self.world_size > 1 and 0 < fetched < yielded * 2 / 3:
@@ -232,9 +230,7 @@ class MixedBatches(Divided, Sampler[list[int]]):
         resume_epoch(self.dataset, *self._start)
 
     def _batches(self, epoch: int, steps: CutSteps) -> Iterator[list[int]]:
-        announced = 0
-        number = 0
-        yielded = 0
+        announced = number = yielded = 0
         before = self.dataset.current.fetched
         for done, step in enumerate(steps):
             if done * steps.size >= announced:

@@ -6,7 +6,6 @@ refer to the dataset's current epoch. DataLoader workers fetch ahead, so that ``
 therefore raises an error.
 """
 
-import os
 import sys
 import threading
 import warnings
@@ -27,6 +26,11 @@ REPEATED = (
     "once, and call set_epoch(epoch) before each pass; epoch_size=N makes short epochs."
 )
 
+TOO_LONG = (
+    "more than twice the {} samples of epoch {} were loaded without set_epoch, with the same scans "
+    "each time. For a pass of several epochs, load MixedStream(train, batch_size=batch_size)."
+)
+
 SHARED_TWICE = (
     "of {} samples for rank {} of {}, only {} were fetched. Another library may divide the "
     "batches among the processes "
@@ -36,8 +40,8 @@ SHARED_TWICE = (
 _COUNTERS = 256  # one counter for each worker, so that none has to wait for another
 
 _EPOCH, _PASS, _WARNED, _USED = range(4)
-"""What the shared integers hold: the current epoch, the epoch of the latest pass, 1 once a repeated
-pass has been warned of, and 1 once the current epoch is used."""
+"""What the shared integers hold: the current epoch, the epoch of the latest pass, 1 once a
+repetition has been warned of, and 1 once the current epoch is used."""
 
 
 class Position(int):
@@ -81,18 +85,22 @@ def share(tensor: Tensor) -> None:
 
 class CurrentEpoch:
     """The current epoch of a dataset in all its processes, and the epochs in which passes over it
-    began."""
+    began.
 
-    def __init__(self) -> None:
+    Args:
+        length: number of samples in an epoch.
+    """
+
+    def __init__(self, length: int) -> None:
+        self._length = length
         self._shared = shared_integers(0, -1, 0, 0)
-        # number of positions fetched, by worker
-        self._fetched = shared_integers(*[0] * _COUNTERS)
+        # by worker: number of positions fetched, and of plain integers since the epoch was set
+        self._fetched = shared_integers(*[0] * 2 * _COUNTERS).view(2, _COUNTERS)
         self.passed: dict[int, tuple[int, int]] = {}
         """By rank: epoch and position where its latest complete pass by ``batches`` began."""
         self.at_start = 0
         """The epoch that this process set, or that was current when it started: for a worker, at
         ``iter(loader)``."""
-        self._process = os.getpid()
         # {fetcher: epoch of its pass}.
         self._passes: WeakKeyDictionary[Any, int] = WeakKeyDictionary()
         self._followers: WeakSet[Any] = WeakSet()
@@ -103,7 +111,7 @@ class CurrentEpoch:
     @property
     def fetched(self) -> int:
         """Number of positions with an epoch that all workers together have fetched."""
-        return int(self._fetched.sum())
+        return int(self._fetched[0].sum())
 
     def set(self, epoch: int) -> None:
         """Set the epoch for all processes.
@@ -112,10 +120,9 @@ class CurrentEpoch:
             ConfigError: if Accelerate sets an epoch before the one that was set or resumed and
                 never used.
         """
-        unused = self._shared[_USED] == 0
         if (
             epoch < self.at_start
-            and unused
+            and not self._shared[_USED]
             and not self._followers
             and count_accelerated()
         ):
@@ -129,6 +136,7 @@ class CurrentEpoch:
         self._shared[_EPOCH] = epoch
         self.at_start = epoch
         self._shared[_USED] = 0
+        self._fetched[1] = 0
         for loader in self._followers:
             loader.iteration = epoch
 
@@ -147,35 +155,41 @@ class CurrentEpoch:
         """
         self._shared[_USED] = 1
         if isinstance(index, Position):
-            worker = get_worker_info()
-            self._fetched[worker.id % _COUNTERS if worker else 0] += 1
+            self._count(0)
             return index.epoch
         epoch = int(self)
         fetcher = _running_fetcher()
         if fetcher is None:  # not within a DataLoader's pass
             return epoch
-        forked = self._process != os.getpid()
-        if forked:
-            self._process = os.getpid()
-            self._passes.clear()
         if fetcher not in self._passes:
             check_whole(fetcher.dataset)
-            first = forked and not _has_answered()
-            self._passes[fetcher] = self.at_start if first else epoch
+            self._passes[fetcher] = self.at_start if _has_just_started() else epoch
             self.note_pass(self._passes[fetcher])
         check_pass(self._passes[fetcher], epoch)
+        self._count(1)
+        if self._fetched[1].sum() > 2 * self._length:
+            self.warn(TOO_LONG.format(self._length, epoch))
         return epoch
 
+    def _count(self, row: int) -> None:
+        worker = get_worker_info()
+        self._fetched[row, worker.id % _COUNTERS if worker else 0] += 1
+
+    def warn(self, text: str) -> None:
+        """Warn of a repetition, once in all processes."""
+        if not self._shared[_WARNED]:
+            self._shared[_WARNED] = 1
+            warnings.warn(text, stacklevel=5)
+
     def note_pass(self, epoch: int) -> None:
-        """Note that a pass begins, and warn once if the pass before had the same epoch; only worker
-        0 does this."""
+        """Note that a pass begins, and warn if the pass before had the same epoch; only worker 0
+        does this."""
         self._shared[_USED] = 1
         worker = get_worker_info()
-        if worker is not None and worker.id > 0:
+        if worker and worker.id:
             return
-        if self._shared[_PASS] == epoch and not self._shared[_WARNED]:
-            self._shared[_WARNED] = 1
-            warnings.warn(REPEATED.format(epoch), stacklevel=4)
+        if self._shared[_PASS] == epoch:
+            self.warn(REPEATED.format(epoch))
         self._shared[_PASS] = epoch
 
     def forget_pass(self) -> None:
@@ -185,15 +199,11 @@ class CurrentEpoch:
 
     def take_pass(self, other: "CurrentEpoch") -> None:
         """Adopt the latest pass of another mixture, so that a repetition is noticed."""
-        self._shared[_PASS:_USED] = other._shared[_PASS:_USED]
+        self._shared[_PASS] = other._shared[_PASS]
         self.passed = dict(other.passed)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            name: value
-            for name, value in self.__dict__.items()
-            if name not in ("_passes", "_followers")
-        }
+        return self.__dict__ | {"_passes": None, "_followers": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ |= state | {
@@ -247,10 +257,11 @@ def _is_mixed(dataset: Any) -> bool:
     return hasattr(dataset, "tell_sources")
 
 
-def _has_answered() -> bool:
-    """Whether this worker has sent something, after which another pass may have begun: its queue
-    has a thread since."""
-    return any(t.name == "QueueFeederThread" for t in threading.enumerate())
+def _has_just_started() -> bool:
+    """Whether this is a worker in its first pass for certain: it has sent nothing, as the queue to
+    the main process has no thread yet."""
+    threads = {thread.name for thread in threading.enumerate()}
+    return get_worker_info() is not None and "QueueFeederThread" not in threads
 
 
 def _running_fetcher() -> Any:

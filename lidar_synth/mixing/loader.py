@@ -1,6 +1,5 @@
 """``MixedLoader``: batches of a mixture, epoch after epoch."""
 
-import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -53,7 +52,7 @@ class MixedLoader(DataLoader[Any]):
         self._mixed = dataset
         self._batches: MixedBatches = dataset.batches(batch_size, drop_last=drop_last)
         # Epoch of the latest pass, and number of its batches done.
-        self._pass: tuple[int, int] = (dataset.epoch, 0)
+        self._pass = (dataset.epoch, 0)
         options.setdefault("collate_fn", dataset.collate)
         super().__init__(
             dataset, batch_sampler=self._batches, num_workers=num_workers, **options
@@ -80,7 +79,7 @@ class MixedLoader(DataLoader[Any]):
         begun, done = self._pass
         # Users look at one batch before training; a mixture of real scans alone may be for tests.
         if begun == epoch and done > 1 and self._mixed.synthetic:
-            warnings.warn(REPEATED.format(epoch), stacklevel=2)
+            self._mixed.current.warn(REPEATED.format(epoch))
         self.set_epoch(epoch)
         # Counted before each batch is yielded, because a loop over exactly len(self) batches never
         # asks for the end of the pass.

@@ -223,7 +223,7 @@ class MixedScans(Dataset[Any]):
             sensor = sensors[0] if sensors else None
             collate = Collate(collate, sensor, unlabelled)
         self.collate: Callable[[Any], Any] = collate
-        self.current = CurrentEpoch()
+        self.current = CurrentEpoch(len(self))
         self._planned: MixingPlan | None = None
         # Whether this mixture continues an earlier one with the same plan; until set_epoch.
         self._continues = False
@@ -364,7 +364,8 @@ class MixedScans(Dataset[Any]):
         """The plan of an epoch, by default the current one; the main process logs its hash once, a
         worker sets the epoch of its real sources."""
         epoch = self.epoch if epoch is None else epoch
-        if self._planned is None or self._planned.epoch != epoch:
+        plan = self._planned  # of this epoch, whatever another thread plans
+        if plan is None or plan.epoch != epoch:
             self._planned = plan = MixingPlan(self.mixture, epoch)
             if get_worker_info() is None:
                 log.info(
@@ -376,7 +377,7 @@ class MixedScans(Dataset[Any]):
                 )
             else:
                 _tell([s for s in self.real if not isinstance(s, MixedScans)], epoch)
-        return self._planned
+        return plan
 
     def expect(self, epoch: int, positions: Iterable[int]) -> None:
         """Announce the next positions to synthetic sources that work ahead.
