@@ -1,7 +1,7 @@
 """``MixedScans``: real and synthetic scans in one map-style dataset."""
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -33,7 +33,7 @@ from lidar_synth.mixing.notices import report_repeats
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
 from lidar_synth.mixing.schedules import (
-    Schedule,
+    Ratio,
     make_schedule,
     share_of,
     to_integer,
@@ -46,9 +46,6 @@ if TYPE_CHECKING:
     from lidar_synth.geometry.transfer import Transfer
 
 log = logging.getLogger(__name__)
-
-Ratio = float | Sequence[float] | Mapping[int, float] | Schedule
-"""The share of synthetic samples in [0, 1], see ``make_schedule``."""
 
 _LATEST: WeakValueDictionary[str, Any] = WeakValueDictionary()
 """{hash of the plan of epoch 0: the latest mixture with that plan}. It shows that a mixture is made
@@ -201,7 +198,7 @@ class MixedScans(Dataset[Any]):
             balanced or locality is not None,
         )
         kept = () if real_as_is else self.real
-        target = None if transfer is None else transfer.target
+        target = getattr(transfer, "target", None)
         sensors = check_together(
             (*kept, *self.synthetic),
             [None] * len(kept) + [target] * len(self.synthetic),

@@ -19,6 +19,9 @@ Schedule = Callable[[int], float]
 """``epoch -> share``: from an epoch, counted from 0, to the share of synthetic samples in [0,
 1]."""
 
+Ratio = float | Sequence[float] | Mapping[int, float] | Schedule
+"""The share of synthetic samples in [0, 1], see ``make_schedule``."""
+
 # largest denominator of a share: products with positions stay within 64 bits
 _FINEST = 10**6
 
@@ -152,9 +155,7 @@ BY_NAME = {"synthetic_first": SyntheticFirst}
 """Schedules by their names in settings, ``{name: epochs}``."""
 
 
-def make_schedule(
-    ratio: float | Sequence[float] | Mapping[int, float] | Schedule,
-) -> Schedule:
+def make_schedule(ratio: Ratio) -> Schedule:
     """Make a schedule from a user's argument.
 
     Args:

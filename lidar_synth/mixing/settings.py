@@ -21,7 +21,8 @@ from lidar_synth.geometry import Scan, Sensor
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.defaults import detection_options, segmentation_options
-from lidar_synth.mixing.scans import MixedScans, Ratio
+from lidar_synth.mixing.scans import MixedScans
+from lidar_synth.mixing.schedules import Ratio
 from lidar_synth.mixing.sources import agree, each, sensor_of
 
 log = logging.getLogger(__name__)

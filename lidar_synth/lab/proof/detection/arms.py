@@ -14,8 +14,7 @@ from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels import ObjectBank
 from lidar_synth.mixing import MixedScans
 from lidar_synth.mixing.defaults import augment_boxes, quarter_of
-from lidar_synth.mixing.scans import Ratio
-from lidar_synth.mixing.schedules import SyntheticFirst
+from lidar_synth.mixing.schedules import Ratio, SyntheticFirst
 
 BASE = "gt_sampling"
 """The arm with which the others are compared."""
