@@ -260,8 +260,7 @@ def _is_mixed(dataset: Any) -> bool:
 def _has_just_started() -> bool:
     """Whether this is a worker in its first pass for certain: it has sent nothing, as the queue to
     the main process has no thread yet."""
-    threads = {thread.name for thread in threading.enumerate()}
-    return get_worker_info() is not None and "QueueFeederThread" not in threads
+    return get_worker_info() is not None and threading.active_count() == 1
 
 
 def _running_fetcher() -> Any:

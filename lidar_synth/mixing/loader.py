@@ -50,7 +50,7 @@ class MixedLoader(DataLoader[Any]):
                     DIVIDED,
                 )
         self._mixed = dataset
-        self._batches: MixedBatches = dataset.batches(batch_size, drop_last=drop_last)
+        self._batches = MixedBatches(dataset, batch_size, drop_last=drop_last)
         # Epoch of the latest pass, and number of its batches done.
         self._pass = (dataset.epoch, 0)
         options.setdefault("collate_fn", dataset.collate)
@@ -92,7 +92,7 @@ class MixedLoader(DataLoader[Any]):
         """The progress after the latest batch, from which any number of ranks and workers can
         resume."""
         epoch, done = self._pass
-        return self._batches.state_dict(done=done if epoch == self._mixed.epoch else 0)
+        return self._batches.state_dict(done if epoch == self._mixed.epoch else 0)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume from a state with the next pass.
