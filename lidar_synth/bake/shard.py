@@ -25,7 +25,7 @@ from lidar_synth.bank.folder import open_folder
 from lidar_synth.errors import ConfigError, FileError, LidarSynthError
 from lidar_synth.files.processes import usable_cores
 from lidar_synth.generate.devices import DTYPES
-from lidar_synth.generate.generator import BATCH, Generator
+from lidar_synth.generate.generator import Generator
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry import RangeImage
 
@@ -139,7 +139,7 @@ def torch_threads(threads: int) -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def _load(
-    model: str, device: str, dtype: str, batch: int, columns: int | None
+    model: str, device: str, dtype: str, batch: int | None, columns: int | None
 ) -> Generator:
     return load_generator(
         model, device=device, dtype=DTYPES[dtype], batch=batch, columns=columns
@@ -157,7 +157,7 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
         job.model,
         job.device,
         job.dtype,
-        job.batch or BATCH[job.device],
+        job.batch,
         job.columns,
     )
     generator = _load(*settings)

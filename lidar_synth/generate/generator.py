@@ -262,7 +262,7 @@ class Generator:
             images += self.tensors.to_images(tensor, self.sensor)
         if (
             self.condition == "semantic"
-            and "label" in self.fields - set(self.header.channels)
+            and "label" not in self.header.channels
             and conditions is not None
         ):
             for image, labels in zip(images, conditions.cpu().numpy(), strict=True):
@@ -389,9 +389,9 @@ class Generator:
             given: as ``condition`` of ``range_images``, which names the errors too.
             count: B.
         """
-        if given is None and self.condition is None:
-            return None
         if self.condition is None:
+            if given is None:
+                return None
             raise ConfigError(
                 f"a condition for {self.name!r}", "none: the model is unconditional"
             )

@@ -56,39 +56,32 @@ def load_generator(
     refuse_worker(device)
     device = check_device(device)
     path = find_model(model)
-    checkpoint = load_checkpoint(path, device)
-    if VELOCITY not in checkpoint.networks:
+    header, networks, digest = load_checkpoint(path, device)
+    if VELOCITY not in networks:
         raise DataError(
             f"{path} is an autoencoder",
             "a model that generates",
             f"Train one with codec={path}.",
         )
-    for network in checkpoint.networks.values():
+    for network in networks.values():
         network.to(dtype).requires_grad_(False)
     if compile:
-        _compile(checkpoint.networks)
-    flow = join(checkpoint.networks)
-    autoencoder = checkpoint.networks.get(CODEC)
+        _compile(networks)
     size = BATCH.get(device.type, 1) if batch is None else batch
+    autoencoder = networks.get(CODEC)
+    flow = join(networks)
     return Generator(
-        path.stem,
-        flow,
-        checkpoint.header,
-        checkpoint.hash,
-        size,
-        autoencoder,
-        columns,
-        path,
+        path.stem, flow, header, digest, size, autoencoder, columns, path
     )
 
 
 def _compile(networks: dict[str, nn.Module]) -> None:
     """Compile the velocity network and the decoder, in place."""
     networks[VELOCITY].compile()
-    if (autoencoder := networks.get(CODEC)) is not None:
+    if CODEC in networks:
         # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``. Compiled for
         # two widths at once, it gives infinite values (torch 2.13).
-        codec: Any = autoencoder
+        codec: Any = networks[CODEC]
         codec.decode = torch.compile(codec.decode, dynamic=False)
 
 
