@@ -2,6 +2,7 @@
 refusals."""
 
 import json
+import logging
 import os
 import pickle
 import warnings
@@ -60,6 +61,27 @@ def test_the_items_of_an_epoch() -> None:
     train.set_epoch(1)
     twice = [item["points"] for item in (*items, *train) if item["id"] == "s1"]
     assert not torch.equal(*twice)  # a scan that is given again is augmented anew
+
+
+def test_a_plan_is_that_of_the_epoch_while_another_is_planned(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """As another thread does it; the message is logged between the two."""
+    train = mixed()
+
+    def plan_another(record: logging.LogRecord) -> bool:
+        if "epoch 0" in record.getMessage():
+            train.plan(1)
+        return True
+
+    logger = logging.getLogger("lidar_synth.mixing.scans")
+    logger.addFilter(plan_another)
+    try:
+        with caplog.at_level(logging.INFO, logger.name):
+            assert train.plan(0).epoch == 0
+    finally:
+        logger.removeFilter(plan_another)
+    assert "epoch 1" in caplog.text
 
 
 def test_random_numbers_of_a_sample_depend_only_on_seed_epoch_and_position() -> None:

@@ -361,7 +361,7 @@ class MixedScans(Dataset[Any]):
         """The plan of an epoch, by default the current one; the main process logs its hash once, a
         worker sets the epoch of its real sources."""
         epoch = self.epoch if epoch is None else epoch
-        plan = self._planned  # of this epoch, whatever another thread plans
+        plan = self._planned  # read once: another thread may plan another epoch
         if plan is None or plan.epoch != epoch:
             self._planned = plan = MixingPlan(self.mixture, epoch)
             if get_worker_info() is None:
