@@ -1,6 +1,7 @@
 """The one door: two sources to batches, epochs that follow one another, resumption."""
 
 import warnings
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from mixtures import Endless, Scans
 import lidar_synth
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS
+from lidar_synth.formats.as_sensor import make_transfer
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing import Linear, MixedScans
 from lidar_synth.mixing.state import make_state
@@ -86,6 +88,15 @@ def test_synthetic_scans_of_other_lasers_get_the_reflectance_of_the_real_ones(
     scans = [train[i] for i in range(len(train)) if train.domain(i)]
     middle = np.median(np.concatenate([scan.reflectance for scan in scans]))
     assert (middle > 0.6) != alike
+
+
+def test_endless_scans_of_other_lasers_get_the_reflectance_of_the_real_ones() -> None:
+    sensor = replace(THEIRS, rows=16)
+    real = Scans("r", 4, sensor=sensor)
+    train = lidar_synth.mix(real, Endless(), ratio=0.5)
+    first = [Endless()[number] for number in range(4)]
+    transfer = make_transfer(sensor, (0.0, 0.0), real, first)
+    assert train.mixture.synthetic[0].identity.endswith(f" as {transfer.identity}")
 
 
 @WORKERS

@@ -174,8 +174,10 @@ def _real(like: str | Path | Source, target: Sensor) -> list[Scan]:
 
 
 def _some(scans: Any) -> list[Scan]:
-    """Ten scans spread over a source; the first four of a generator."""
+    """Ten scans spread over a source; the first four of a generator or an endless source."""
     if hasattr(scans, "range_images"):
-        return list(scans.scans(0, list(range(4))))
+        scans = scans.as_synthetic()
+    if getattr(scans, "length", 0) is None:
+        return _read(scans, range(4))
     numbers = sorted({round(k * (len(scans) - 1) / 9) for k in range(10)})
     return _read(scans, numbers)
