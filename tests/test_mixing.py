@@ -24,6 +24,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan, model_provenance
 from lidar_synth.lab.town import Town
 from lidar_synth.mixing import MixedScans, MixedStream, Sources
+from lidar_synth.mixing.collate import Form
 from lidar_synth.mixing.state import make_state
 from lidar_synth.noise import keyed_rng
 
@@ -451,6 +452,17 @@ def test_another_default_dtype_does_not_change_batches() -> None:
     finally:
         torch.set_default_dtype(torch.float32)
     assert batch["loss_weight"].dtype == batch["points"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("form", ["offsets", "padded", "range"])
+def test_another_default_device_does_not_change_batches(form: Form) -> None:
+    def batch() -> Any:
+        train = MixedScans(Scans("r", 2), Endless(), 0.5, collate=form)
+        return train.collate([train[0], train[1]])
+
+    with torch.device("meta"):
+        elsewhere = batch()
+    assert plain(elsewhere) == plain(batch())
 
 
 def test_fewer_samples_than_ranks_gives_a_warning() -> None:

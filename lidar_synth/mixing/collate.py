@@ -90,9 +90,11 @@ class Collate:
             "boxes": torch.cat(boxes),
             "box_offsets": _offsets(boxes),
             "names": [item["names"] for item in items],
-            "domain": torch.tensor([item["domain"] for item in items]),
+            "domain": torch.tensor([item["domain"] for item in items], device="cpu"),
             "loss_weight": torch.tensor(
-                [item.get("loss_weight", 1.0) for item in items], dtype=torch.float32
+                [item.get("loss_weight", 1.0) for item in items],
+                dtype=torch.float32,
+                device="cpu",
             ),
             "id": [item["id"] for item in items],
         }
@@ -149,7 +151,8 @@ def _padded_points(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Te
         "label": pad_sequence(label, batch_first=True, padding_value=IGNORE),
         "confidence": pad_sequence(confidence, batch_first=True),
         "mask": pad_sequence(
-            [torch.ones(len(p), dtype=torch.bool) for p in points], batch_first=True
+            [torch.ones_like(part, dtype=torch.bool) for part in label],
+            batch_first=True,
         ),
     }
 
@@ -196,4 +199,5 @@ def _columns(items: Sequence[Item]) -> list[list[Tensor]]:
 
 def _offsets(parts: Sequence[Tensor]) -> Tensor:
     """(B + 1,) int64, the start of each part, and the end of the last."""
-    return torch.tensor([0, *(len(part) for part in parts)]).cumsum(0)
+    ends = [0, *(len(part) for part in parts)]
+    return torch.tensor(ends, device="cpu").cumsum(0)

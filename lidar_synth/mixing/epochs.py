@@ -71,9 +71,8 @@ def shared_integers(*values: int) -> Tensor:
     A plain attribute does not work, because persistent workers keep the copy of the dataset with
     which they started.
     """
-    tensor = torch.tensor(values, dtype=torch.int64)
-    share(tensor)
-    return tensor
+    tensor = torch.tensor(values, dtype=torch.int64, device="cpu")
+    return tensor.share_memory_()  # type: ignore[no-untyped-call, no-any-return]
 
 
 def share(tensor: Tensor) -> None:

@@ -41,7 +41,8 @@ class Slots:
         )
         head = 8 * len(COUNTERS) + _WORDS
         try:
-            memory = torch.zeros(head + count * self._size, dtype=torch.uint8)
+            size = head + count * self._size
+            memory = torch.zeros(size, dtype=torch.uint8, device="cpu")
             self._memory = memory.share_memory_()  # type: ignore[no-untyped-call]
         except RuntimeError as error:
             raise ConfigError(
