@@ -117,6 +117,14 @@ def test_a_generator_that_hangs_is_not_waited_for_longer_than_stated(
     assert gone(bank.pid)
 
 
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads /proc")
+def test_a_generator_gets_no_ctrl_c_while_it_starts(bank: RollingBank) -> None:
+    """A terminal sends it to every process; one that starts would print a traceback."""
+    status = Path(f"/proc/{bank.pid}/status").read_text()
+    [blocked] = [v for v in status.splitlines() if v.startswith("SigBlk")]
+    assert int(blocked.split()[1], 16) & 1 << (signal.SIGINT - 1)
+
+
 def test_a_model_that_loads_for_too_long(path: Path) -> None:
     with pytest.raises(
         ProcessError,

@@ -6,6 +6,7 @@ timeout.
 """
 
 import os
+import signal
 import threading
 import weakref
 from multiprocessing import connection, current_process, get_context
@@ -15,7 +16,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from lidar_synth.errors import ConfigError, ProcessError
-from lidar_synth.files.processes import GUARD
+from lidar_synth.files.processes import GUARD, defer_signals
 from lidar_synth.mixing.service.process import GET, GeneratorJob, receive, run, send
 from lidar_synth.mixing.service.slots import Slots
 
@@ -52,7 +53,8 @@ class Client:
         self._process = context.Process(
             target=run, args=(job, slots, sender), name="lidar-synth", daemon=True
         )
-        self._process.start()
+        with defer_signals(signal.SIGINT):
+            self._process.start()
         sender.close()
         self._owner = os.getpid()
         self.pid = self._process.pid or 0
@@ -77,7 +79,6 @@ class Client:
         Raises:
             ProcessError: if the process has died, or does not answer in time.
         """
-        answered = False
         try:
             self.tell(*request)
             line = self._line()
@@ -85,15 +86,14 @@ class Client:
                 raise self._late(
                     f"answered (scan {request[1]})" if request[0] == GET else "answered"
                 )
-            answer = receive(line)
-            answered = True
-            return answer
-        except (EOFError, OSError) as error:
-            raise error if isinstance(error, ProcessError) else self._died() from error
-        finally:
+            return receive(line)
+        except BaseException as error:
             # a late answer must not be taken for that of another request
-            if not answered:
-                self._connections.pop(_thread_key(), None)
+            self._connections.pop(_thread_key(), None)
+            ended = isinstance(error, EOFError | OSError)
+            if ended and not isinstance(error, ProcessError):
+                raise self._died() from error
+            raise
 
     def tell(self, *request: int) -> None:
         """Send a request that has no answer; raises ``OSError`` if the process has died."""
