@@ -49,8 +49,8 @@ class RollingBank:
     ``refresh``, with which the scan is a function of number and epoch.
 
     Workers inherit the bank when they start, forked or spawned. The generator process ends with
-    ``close()``, at the end of a ``with`` block, or with the process that made the bank; in each
-    case its shared memory is freed.
+    ``close()``, at the end of a ``with`` block, or with the process that made the bank; its shared
+    memory is freed with the last process that maps it, such as a worker.
 
     Args:
         model: the name of a shipped model or the path of a checkpoint; the model must be
