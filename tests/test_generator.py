@@ -490,8 +490,9 @@ def test_a_gpu_is_refused_if_it_is_unavailable_and_in_dataloader_workers(
             load_generator(path, device="cuda")
     monkeypatch.setattr(devices, "get_worker_info", lambda: SimpleNamespace(id=0))
     three_ways = r"\(A\) bake .*\(B\) a rolling .*\(C\) mix in"
-    with pytest.raises(ConfigError, match=three_ways):
-        load_generator(path, device="cuda")
+    for device in ("cuda", "xpu:1", "mps"):
+        with pytest.raises(ConfigError, match=three_ways):
+            load_generator(path, device=device)
     monkeypatch.setattr(Generator, "device", torch.device("cuda"))
     with pytest.raises(ConfigError, match=three_ways):
         generator.scans(0, [0])

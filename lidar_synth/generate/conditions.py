@@ -417,7 +417,7 @@ def batch_of(
     if isinstance(given, np.ndarray):
         # torch refuses flipped arrays and warns of read-only ones
         given = torch.from_numpy(np.require(given, requirements=["C", "W"]))
-    values = given
+    values: Tensor = given
     if values.is_floating_point() or values.is_complex() or values.dtype == torch.bool:
         raise DataError(f"a {name} condition of {values.dtype}", "whole numbers, uint8")
     if values.shape not in (shape, (count, *shape)):

@@ -55,14 +55,14 @@ def _missing(device: object, available: list[str]) -> ConfigError:
 
 
 def refuse_worker(device: torch.device | str) -> None:
-    """Refuse CUDA in DataLoader workers: a forked process cannot use it, and each spawned one would
-    need a context."""
-    if str(device).startswith("cuda") and get_worker_info() is not None:
+    """Refuse a GPU in DataLoader workers: a forked process cannot use it, and each spawned one
+    would need a context."""
+    on_cpu = str(device).startswith(("cpu", "meta"))
+    if not on_cpu and get_worker_info() is not None:
         raise ConfigError(
             "a generator on the GPU inside a DataLoader worker",
             "one of three ways: (A) bake a bank first and read it in the workers, (B) a rolling "
-            "bank that one spawned "
-            "process fills, (C) mix in the main process, on the training device",
+            "bank, (C) mix in the main process, on the training device",
             "On the CPU, load_generator(..., device='cpu') works in workers too.",
         )
 

@@ -238,7 +238,7 @@ class Generator:
             ConfigError: on an invalid seed, index, number of steps or solver, a condition for an
                 unconditional model, guidance outside 0 to 100 or of a model that was trained
                 without blank conditions, objects that cannot be cast or do not have the layout's
-                classes, or CUDA in a DataLoader worker.
+                classes, or a GPU in a DataLoader worker.
             FileError: if the image of a scan cannot be read.
             DataError: on a condition of another shape or with invalid values, or if a condition is
                 missing.

@@ -41,7 +41,7 @@ def load_generator(
             at about half of the decoder's cost.
 
     Raises:
-        ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, a
+        ConfigError: on an unknown name, an unavailable device, a GPU in a DataLoader worker, a
             batch below 1, or a number of columns that the model cannot generate.
         FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
         LibraryError: on a model on the hub without the extra ``hub``.
@@ -70,9 +70,7 @@ def load_generator(
     size = BATCH.get(device.type, 1) if batch is None else batch
     autoencoder = networks.get(CODEC)
     flow = join(networks)
-    return Generator(
-        path.stem, flow, header, digest, size, autoencoder, columns, path
-    )
+    return Generator(path.stem, flow, header, digest, size, autoencoder, columns, path)
 
 
 def _compile(networks: dict[str, nn.Module]) -> None:
