@@ -33,6 +33,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.files.hub import shipped_models
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.generator import Generated, Generator
+from lidar_synth.geometry.layout.layout import CODES
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.lab.evaluate.conditions import sight_agreement
@@ -64,6 +65,19 @@ def test_models_load_without_the_compiler_of_torch_and_draw_nothing() -> None:
         assert not {"torch._dynamo", "sympy"} & sys.modules.keys()
     """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_another_default_dtype_changes_no_scan() -> None:
+    generator = load_generator("town-layout", columns=1024)
+    layout = np.zeros((5, *generator.header.sensor.shape), np.uint8)
+    layout[:4] = [[[CODES["Car"]]], [[40]], [[0]], [[7]]]
+    [expected] = generator.samples(0, [0], layout, steps=1)
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        [image] = generator.samples(0, [0], layout, steps=1)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(image, expected)
 
 
 @pytest.mark.parametrize("columns", [2048, 1024])

@@ -14,6 +14,7 @@ from lidar_synth.generate.flow.path import Velocity
 from lidar_synth.generate.flow.solvers import solve, uniform_grid
 from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.convolution import WrapConv, fold, unfold
+from lidar_synth.generate.models.efficient_unet import EfficientUNet
 from lidar_synth.generate.models.lidm.diffusion import (
     DiffusionUNet,
     schedule_times,
@@ -54,6 +55,26 @@ T = torch.tensor([0.3, 0.8])
 
 def test_a_fresh_network_returns_zero() -> None:
     assert not build_network("unet", SMALL)(state(), T).any()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("kind", ["unet", "diffusion_unet", "efficient_unet"])
+def test_another_default_dtype_changes_nothing(kind: str) -> None:
+    y = state(shape=(3, 16, 64))
+    if kind == "efficient_unet":
+        net: nn.Module = EfficientUNet(
+            (16, 64), 3, width=32, angles=torch.zeros(2, 16, 64)
+        ).eval()
+        for parameter in net.parameters():
+            nn.init.normal_(parameter, std=0.1)
+    else:
+        net = network(kind, resolution=(16, 64))
+    expected = net(y, T)
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        assert torch.equal(net(y, T), expected)
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 @torch.no_grad()

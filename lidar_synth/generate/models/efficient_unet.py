@@ -289,6 +289,6 @@ def sinusoids(values: Tensor, width: int) -> Tensor:
     """Sines, then cosines, (B, width) of values (B,), with angular frequencies from 1 to 1e-4."""
     count = width // 2
     step = -math.log(_LONGEST) / (count - 1)
-    frequencies = (step * torch.arange(count, device=values.device)).exp()
+    frequencies = (step * torch.arange(count, device=values.device).float()).exp()
     turn = values[:, None] * frequencies
     return torch.cat((turn.sin(), turn.cos()), -1).to(values.dtype)

@@ -228,7 +228,7 @@ class UNet(Network):
                 f"times of shape {tuple(step.shape)} for {count} states",
                 "one time per state, or one for all",
             )
-        half = torch.arange(self.width // 2, device=step.device)
+        half = torch.arange(self.width // 2, device=step.device).float()
         turn = step.float().expand(count)[:, None] * torch.exp(
             half * (-math.log(_LONGEST) / (self.width // 2))
         )

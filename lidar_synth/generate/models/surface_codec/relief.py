@@ -36,7 +36,7 @@ def relief_fields(uniform_noise: Tensor, merged: int = 1) -> Tensor:
         step = span // merged
         # no number is used twice
         nodes = to_normal(rows[..., first::step]).unsqueeze(-1)
-        turn = torch.arange(step, device=rows.device) * (math.pi / 2 / step)
+        turn = torch.arange(step, device=rows.device).float() * (math.pi / 2 / step)
         fields.append(
             (nodes * turn.cos() + nodes.roll(-1, -2) * turn.sin()).flatten(-2)
         )
