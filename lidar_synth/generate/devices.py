@@ -36,10 +36,7 @@ def check_device(device: str | torch.device) -> torch.device:
         # Without querying GPUs: after CUDA is initialised, forked children cannot use it.
         return wanted
     available = available_devices()
-    kinds = {name.partition(":")[0] for name in available}
-    if str(wanted) not in available and (
-        wanted.type not in kinds or wanted.index is not None
-    ):
+    if not any(str(wanted) in (name, name.partition(":")[0]) for name in available):
         raise _missing(device, available)
     return wanted
 

@@ -266,12 +266,9 @@ class Generator:
             and conditions is not None
         ):
             for image, labels in zip(images, conditions.cpu().numpy(), strict=True):
-                image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(
-                    np.uint8
-                )
-                image.channels["confidence"] = (
-                    image.channels["label"] != IGNORE
-                ).astype(np.float32)
+                label = np.where(image.mask, labels, np.uint8(IGNORE))
+                image.channels["label"] = label
+                image.channels["confidence"] = (label != IGNORE).astype(np.float32)
         if boxes is None:
             return images
         add = boxed.add_boxes
