@@ -1,6 +1,8 @@
 """The generator: a scan is a function of (checkpoint, condition, grid, seed, index); invalid
 requests are refused."""
 
+import copy
+import pickle
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -432,6 +434,11 @@ def test_compile_compiles_the_decoder_too(
     before = len(graphs)
     compiled.scans(0, [0])
     assert len(graphs) > before  # those of the flow
+    for copied in (copy.deepcopy(compiled), pickle.loads(pickle.dumps(compiled))):
+        for parameter in copied.autoencoder.parameters():
+            torch.nn.init.zeros_(parameter)
+        decoded = copied.codec.decode(z, given)
+        assert not torch.allclose(decoded, eager.codec.decode(z, given))
 
 
 def test_a_damaged_shipped_checkpoint_is_refused(

@@ -3,7 +3,7 @@ run provides."""
 
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
@@ -58,6 +58,12 @@ class Autoencoder(Network):
     @abstractmethod
     def loss(self, x: Tensor, noise: Tensor, objective: Objective) -> Tensor:
         """The training loss of images, a scalar; ``noise`` is standard normal, of their shape."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        state: dict[str, Any] = super().__getstate__()
+        # of a compiled one, which would decode with this network's weights
+        state.pop("decode", None)
+        return state
 
     def measure(self, images: Iterable[Tensor], objective: Objective) -> None:
         """Set the values that are measured on images (1, C, H, W) instead of trained."""
