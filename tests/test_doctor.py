@@ -173,7 +173,7 @@ def test_the_cards_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("driver", "build", "state", "found"),
     [
-        (None, None, "absent", "no NVIDIA driver"),
+        (None, None, "absent", "no NVIDIA driver: torch computes on cpu, mps"),
         ("/usr/bin/nvidia-smi", None, "check", "built for the CPU"),
         ("/usr/bin/nvidia-smi", "13.0", "check", "finds no GPU"),
     ],
@@ -186,6 +186,8 @@ def test_why_there_is_no_card(
     found: str,
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     monkeypatch.setattr(torch.version, "cuda", build)
     monkeypatch.setattr(doctor.shutil, "which", lambda name: driver)  # type: ignore[attr-defined]
     [finding] = doctor._cuda()

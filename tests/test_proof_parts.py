@@ -33,6 +33,7 @@ from lidar_synth.lab.proof.arms import Row, options_of, policy_of, rows
 from lidar_synth.lab.proof.budget import estimate_minutes, within
 from lidar_synth.lab.proof.command import describe
 from lidar_synth.lab.proof.drawing import ticks
+from lidar_synth.lab.proof.machine import machine
 from lidar_synth.lab.proof.places import APART, SPLITS, choose, find_places
 from lidar_synth.lab.proof.plan import describe as describe_plan
 from lidar_synth.lab.proof.planning import make_plan
@@ -50,6 +51,11 @@ from lidar_synth.lab.town import Town
 from lidar_synth.labels.edit.unboxed import join_cubes
 from lidar_synth.labels.exchange import thin_scan
 from lidar_synth.noise import keyed_rng
+
+
+def test_a_figure_tells_the_device_that_was_used() -> None:
+    assert ", no GPU used, torch" in machine("cpu")
+    assert ", mps, torch" in machine("mps")
 
 
 def test_wrapped_padding_is_circular_padding() -> None:

@@ -270,6 +270,8 @@ def _cuda() -> Iterator[Finding]:
     try:
         import torch
 
+        from lidar_synth.generate.devices import available_devices
+
         cards = [
             torch.cuda.get_device_properties(i)
             for i in range(torch.cuda.device_count())
@@ -286,9 +288,8 @@ def _cuda() -> Iterator[Finding]:
     if cards:
         return
     if shutil.which("nvidia-smi") is None:
-        yield Finding(
-            "devices", "CUDA", "absent", "no NVIDIA driver: everything runs on the CPU"
-        )
+        found = f"no NVIDIA driver: torch computes on {', '.join(available_devices())}"
+        yield Finding("devices", "CUDA", "absent", found)
     elif torch.version.cuda is None:
         yield Finding(
             "devices",

@@ -19,7 +19,7 @@ def machine(device: str = "cpu") -> str:
         if line.startswith("model name")
     ]
     name = names[0] if names else platform.processor() or platform.machine()
-    card = "no GPU used"
+    card = "no GPU used" if device == "cpu" else device
     if torch.device(device).type == "cuda":
         card = torch.cuda.get_device_name(device)
     version = torch.__version__.partition("+")[0]
