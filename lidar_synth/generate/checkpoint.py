@@ -277,7 +277,7 @@ def save_checkpoint(
     for name, network in networks.items():
         state = {k: v.detach().cpu() for k, v in network.state_dict().items()}
         assemble(*header.networks[name], state, f"the network {name!r}")
-        parameters = {k for k, _ in network.named_parameters()}
+        parameters = dict(network.named_parameters())
         for key, tensor in state.items():
             tensors[f"{name}.{key}"] = tensor.to(
                 dtype if key in parameters else None
@@ -417,7 +417,7 @@ def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
     if bad := [
         k
         for k, v in tensors.items()
-        if v.is_complex() or not bool(torch.isfinite(v.float()).all())
+        if v.is_complex() or not torch.isfinite(v.float()).all()
     ]:
         raise DataError(
             f"{what} has NaN or infinity in {bad}", "finite weights and ray angles"

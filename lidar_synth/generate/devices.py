@@ -42,12 +42,11 @@ def check_device(device: str | torch.device) -> torch.device:
 
 
 def _missing(device: object, available: list[str]) -> ConfigError:
-    hint = (
-        "A GPU needs its driver and a build of torch that supports it; `lidar-synth doctor` shows "
-        "what is installed."
-    )
     return ConfigError(
-        f"device {str(device)!r}", f"an available one: {', '.join(available)}", hint
+        f"device {str(device)!r}",
+        f"an available one: {', '.join(available)}",
+        "A GPU needs its driver and a build of torch that supports it; `lidar-synth doctor` shows "
+        "what is installed.",
     )
 
 

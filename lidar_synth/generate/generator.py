@@ -192,8 +192,7 @@ class Generator:
         parts = [self.network, *filter(None, [self.autoencoder])]
         size = sum(p.numel() for part in parts for p in part.parameters())
         card = model_card(str(repository), self.header, self.hash, size, licence)
-        files = {self.path.name: self.path}
-        return push(repository, card.encode(), files, private)
+        return push(repository, card.encode(), {self.path.name: self.path}, private)
 
     def as_synthetic(self, seed: int = 0) -> "Generated":
         """The scans of a seed by number, made when they are read."""

@@ -68,9 +68,16 @@ def load_generator(
     if compile:
         _compile(networks)
     size = BATCH.get(device.type, 1) if batch is None else batch
-    autoencoder = networks.get(CODEC)
-    flow = join(networks)
-    return Generator(path.stem, flow, header, digest, size, autoencoder, columns, path)
+    return Generator(
+        path.stem,
+        join(networks),
+        header,
+        digest,
+        size,
+        networks.get(CODEC),
+        columns,
+        path,
+    )
 
 
 def _compile(networks: dict[str, nn.Module]) -> None:
@@ -96,8 +103,11 @@ def find_model(model: str | Path) -> Path:
     path = shipped.get(str(model), Path(model))
     if path.suffix != ".safetensors":
         names = ", ".join(shipped) or "none in this installation"
-        expected = f"a shipped one ({names}), a .safetensors file or hf://user/model"
-        raise ConfigError(f"model {str(model)!r}", expected, suggest(model, shipped))
+        raise ConfigError(
+            f"model {str(model)!r}",
+            f"a shipped one ({names}), a .safetensors file or hf://user/model",
+            suggest(model, shipped),
+        )
     return path
 
 
