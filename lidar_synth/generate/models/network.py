@@ -60,7 +60,7 @@ class Autoencoder(Network):
         """The training loss of images, a scalar; ``noise`` is standard normal, of their shape."""
 
     def __getstate__(self) -> dict[str, Any]:
-        state: dict[str, Any] = super().__getstate__()
+        state: dict[str, Any] = super().__getstate__()  # type: ignore[no-untyped-call]
         # of a compiled one, which would decode with this network's weights
         state.pop("decode", None)
         return state
