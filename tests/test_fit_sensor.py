@@ -302,6 +302,10 @@ WRONG_PATHS: dict[str, tuple[Callable[[], object], str]] = {
         lambda: reskew(turned().scan, driving(1.0), 50.0),
         "those of the poses",
     ),
+    "half a circle": (
+        lambda: Trajectory([0.0, 1.0], [np.eye(4), np.diag([-1, -1, 1, 1])]).at(0.5),
+        "half a circle",
+    ),
     "no times": (
         lambda: reskew(replace(turned().scan, time=None), driving(1.0)),
         "has no time",

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
+from numpy.typing import ArrayLike
 
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.arrays import Float64Array
+from lidar_synth.geometry.motion import from_world, interpolate_poses, to_world
 from lidar_synth.geometry.scan import Scan
 
 EXTENSION = 1.5
@@ -40,9 +40,6 @@ class Trajectory:
         self.times = np.asarray(times, np.float64)
         self.poses = np.asarray(poses, np.float64)
         self._check()
-        rotations = self.poses[:, :3, :3]
-        steps = Rotation.from_matrix(rotations[:-1].swapaxes(1, 2) @ rotations[1:])
-        self._steps = steps.as_rotvec()
 
     def _check(self) -> None:
         count = len(self.times) if self.times.ndim == 1 else 0
@@ -68,52 +65,27 @@ class Trajectory:
 
     def at(self, time: float) -> Float64Array:
         """(4, 4) the pose at one moment."""
-        pose = np.eye(4)
-        segment, fraction = self._segments(np.array([time]))
-        pose[:3, 3] = self._positions(segment, fraction)[0]
-        turned = Rotation.from_rotvec(self._steps[segment[0]] * fraction)
-        pose[:3, :3] = self.poses[segment[0], :3, :3] @ turned.as_matrix()
-        return pose
+        [pose] = self.poses_at(np.array([time]))
+        return np.asarray(pose)
 
-    def from_world(self, points: Float64Array, times: Float64Array) -> Float64Array:
-        """(N, 3) points of the world in the frame that the sensor had at the time of each."""
-        segment, fraction = self._segments(times)
-        offset = points - self._positions(segment, fraction)
-        local = np.einsum("nji,nj->ni", self.poses[segment, :3, :3], offset)
-        return rotate(np.asarray(local), -fraction[:, None] * self._steps[segment])
+    def poses_at(self, times: Float64Array) -> Float64Array:
+        """(N, 4, 4) the poses at moments (N,), seconds.
 
-    def to_world(self, points: Float64Array, times: Float64Array) -> Float64Array:
-        """(N, 3) points in the world, from the frame that the sensor had at the time of each."""
-        segment, fraction = self._segments(times)
-        turned = rotate(points, fraction[:, None] * self._steps[segment])
-        turned = np.einsum("nij,nj->ni", self.poses[segment, :3, :3], turned)
-        return np.asarray(turned + self._positions(segment, fraction))
-
-    def _positions(
-        self, segment: NDArray[np.intp], fraction: Float64Array
-    ) -> Float64Array:
-        start = self.poses[segment, :3, 3]
-        end = self.poses[segment + 1, :3, 3]
-        return np.asarray(start + fraction[:, None] * (end - start))
-
-    def _segments(self, times: Float64Array) -> tuple[NDArray[np.intp], Float64Array]:
-        """The segment of each time (N,), and the fraction of the segment that has passed;
-        ``EXTENSION`` before the first and after the last one is accepted."""
-        segment = np.clip(
-            np.searchsorted(self.times, times, "right") - 1, 0, len(self.times) - 2
-        )
-        fraction = (times - self.times[segment]) / (
-            self.times[segment + 1] - self.times[segment]
-        )
+        Raises:
+            DataError: on moments more than ``EXTENSION`` outside, or poses that turn by half a
+                circle from one to the next.
+        """
+        first, last = self.times[[0, -1]]
+        before, after = EXTENSION * np.diff(self.times)[[0, -1]]
         if len(times) and not (
-            fraction.min() >= -EXTENSION and fraction.max() <= 1 + EXTENSION
+            first - before <= times.min() <= times.max() <= last + after
         ):
             given = f"points from {times.min():.3f} to {times.max():.3f} s"
-            span = f"{self.times[0]:.3f} to {self.times[-1]:.3f} s"
+            span = f"{first:.3f} to {last:.3f} s"
             raise DataError(
                 given, f"times within those of the poses, {span}", "Check `moment`."
             )
-        return segment, fraction
+        return interpolate_poses(self.times, self.poses, times, np.inf)
 
 
 def reskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
@@ -142,7 +114,8 @@ def reskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
     times = _times(scan, moment)
     pose = trajectory.at(moment)
     world = scan.points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-    return replace(scan, points=trajectory.from_world(world, times).astype(np.float32))
+    measured = from_world(world, trajectory.poses_at(times))
+    return replace(scan, points=measured.astype(np.float32))
 
 
 def deskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
@@ -162,7 +135,7 @@ def deskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
     """
     times = _times(scan, moment)
     pose = trajectory.at(moment)
-    world = trajectory.to_world(scan.points.astype(np.float64), times)
+    world = to_world(scan.points.astype(np.float64), trajectory.poses_at(times))
     return replace(
         scan, points=((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
     )
@@ -174,17 +147,3 @@ def _times(scan: Scan, moment: float) -> Float64Array:
             f"scan {scan.id!r} has no time", "seconds for each point in scan.time"
         )
     return moment + scan.time.astype(np.float64)
-
-
-def rotate(points: Float64Array, vectors: Float64Array) -> Float64Array:
-    """(N, 3) points turned by rotation vectors (N, 3) or (3,), radians (Rodrigues' formula)."""
-    # Not by scipy, whose older versions refuse empty arrays.
-    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    axis = vectors / np.maximum(angle, 1e-12)
-    along = np.sum(axis * points, -1, keepdims=True)
-    cosine = np.cos(angle)
-    return np.asarray(
-        points * cosine
-        + np.cross(axis, points) * np.sin(angle)
-        + axis * along * (1 - cosine)
-    )

@@ -18,7 +18,10 @@ extrapolated."""
 
 
 def interpolate_poses(
-    times: Float64Array, poses: Float64Array, at: Float64Array
+    times: Float64Array,
+    poses: Float64Array,
+    at: Float64Array,
+    farthest: float = FARTHEST,
 ) -> Float64Array:
     """The poses at other times: between two poses, velocity and angular velocity are constant.
 
@@ -28,13 +31,14 @@ def interpolate_poses(
         times: (P,) seconds, increasing.
         poses: (P, 4, 4) rigid transforms.
         at: (N,) seconds.
+        farthest: maximum time before the first pose or after the last one, seconds.
 
     Returns:
         (N, 4, 4) float64.
 
     Raises:
-        DataError: on times that do not increase or do not fit the poses, fewer than two poses, or a
-            time more than ``FARTHEST`` outside.
+        DataError: on times that do not increase or do not fit the poses, fewer than two poses,
+            poses that turn by half a circle, or a time more than ``farthest`` outside.
 
     Example:
         >>> import numpy as np
@@ -55,11 +59,11 @@ def interpolate_poses(
         )
     if not len(at):
         return np.empty((0, 4, 4))
-    if not times[0] - FARTHEST <= at.min() <= at.max() <= times[-1] + FARTHEST:
+    if not times[0] - farthest <= at.min() <= at.max() <= times[-1] + farthest:
         raise DataError(
             f"times from {at.min() - times[0]:g} s to {at.max() - times[0]:g} s after the first "
             "pose",
-            f"-{FARTHEST:g} s to {times[-1] - times[0] + FARTHEST:g} s: poses of the same "
+            f"-{farthest:g} s to {times[-1] - times[0] + farthest:g} s: poses of the same "
             "recording",
         )
     start = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
@@ -99,6 +103,12 @@ def from_world(points: Float64Array, poses: Float64Array) -> Float64Array:
     )
 
 
+def to_world(points: Float64Array, poses: Float64Array) -> Float64Array:
+    """The inverse of ``from_world``."""
+    turned = np.einsum("...ij,...j->...i", poses[..., :3, :3], points)
+    return np.asarray(turned + poses[..., :3, 3], np.float64)
+
+
 def pose_of(values: Sequence[float]) -> Float64Array:
     """(4, 4) pose of a position and a quaternion: x, y, z in metres, then w, x, y, z of any
     length."""
@@ -108,3 +118,17 @@ def pose_of(values: Sequence[float]) -> Float64Array:
     cross = np.cross(np.eye(3), vector)
     pose[:3, :3] += 2 * (scalar * cross + cross @ cross)
     return pose
+
+
+def rotate(points: Float64Array, vectors: Float64Array) -> Float64Array:
+    """(N, 3) points turned by rotation vectors (N, 3) or (3,), radians (Rodrigues' formula)."""
+    # Not by scipy, whose older versions refuse empty arrays.
+    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    axis = vectors / np.maximum(angle, 1e-12)
+    along = np.sum(axis * points, -1, keepdims=True)
+    cosine = np.cos(angle)
+    return np.asarray(
+        points * cosine
+        + np.cross(axis, points) * np.sin(angle)
+        + axis * along * (1 - cosine)
+    )

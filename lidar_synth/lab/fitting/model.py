@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lidar_synth.geometry.arrays import Float64Array, Int64Array
-from lidar_synth.geometry.deskew import rotate
 from lidar_synth.geometry.lines import nearest_beams, residuals
+from lidar_synth.geometry.motion import rotate
 
 STEPS = 12
 CAP = np.radians(0.1)
