@@ -9,45 +9,28 @@ counts as exclusive: an open file cannot be removed there.
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 if sys.platform == "win32":
+    LOCK_SH = LOCK_EX = LOCK_NB = LOCK_UN = 0
 
-    def _lock(file: BinaryIO, alone: bool) -> bool:
-        return True
-
-    def _take(file: BinaryIO) -> bool:
-        return True
-
-    def _wait(file: BinaryIO, until_free: bool) -> None:
-        pass
+    def flock(file: BinaryIO, how: int) -> None:
+        """Windows has no flock."""
 
 else:
-    import fcntl
+    from fcntl import LOCK_EX, LOCK_NB, LOCK_SH, LOCK_UN, flock
 
-    def _lock(file: BinaryIO, alone: bool) -> bool:
-        """Take the lock: shared after waiting, or exclusive (``try_lock``) without waiting; False
-        if unavailable."""
-        with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB if alone else fcntl.LOCK_SH)
-            return True
-        return False
 
-    def _take(file: BinaryIO) -> bool:
-        """Take the lock; False only if another process holds it, not where the file system has no
-        locks."""
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            return not isinstance(error, BlockingIOError)
-        return True
-
-    def _wait(file: BinaryIO, until_free: bool) -> None:
-        """Take the lock after waiting, or release it."""
-        with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX if until_free else fcntl.LOCK_UN)
+def _flock(file: BinaryIO, how: int, unsupported: bool = False) -> bool:
+    """Take or release the lock; False if it is not available, ``unsupported`` where the file
+    system has no locks."""
+    try:
+        flock(file, how)
+    except OSError as error:
+        return unsupported and not isinstance(error, BlockingIOError)
+    return True
 
 
 @contextmanager
@@ -58,7 +41,7 @@ def one_writer(path: Path) -> Iterator[bool]:
         OSError: if the file cannot be made.
     """
     with path.open("ab") as file:
-        yield _take(file)
+        yield _flock(file, LOCK_EX | LOCK_NB, unsupported=True)
 
 
 @contextmanager
@@ -70,11 +53,11 @@ def lock_alone(path: Path) -> Iterator[None]:
         OSError: if the file cannot be made.
     """
     with path.open("ab") as file:
-        _wait(file, until_free=True)
+        _flock(file, LOCK_EX)
         try:
             yield
         finally:  # not only by closing: a process that was forked meanwhile has the file open too
-            _wait(file, until_free=False)
+            _flock(file, LOCK_UN)
 
 
 @contextmanager
@@ -85,7 +68,7 @@ def lock_shared(path: Path) -> Iterator[None]:
         OSError: if the file cannot be opened.
     """
     with path.open("rb") as file:
-        _lock(file, alone=False)
+        _flock(file, LOCK_SH)
         yield
 
 
@@ -99,4 +82,4 @@ def try_lock(path: Path) -> Iterator[bool]:
         yield False
         return
     with file:
-        yield _lock(file, alone=True)
+        yield _flock(file, LOCK_EX | LOCK_NB)
