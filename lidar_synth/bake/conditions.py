@@ -5,11 +5,11 @@ The dataset of a layout model may be a YAML file of a layout, or a folder of the
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError, choose
 from lidar_synth.files.disk import hash_of_names, read_file
@@ -32,23 +32,6 @@ OBJECTS: dict[str, Callable[[Sensor], Any]] = {
 the model draws."""
 
 
-class ConditionSource(Protocol):
-    """A dataset of conditions.
-
-    Attributes:
-        ids: names of its entries.
-    """
-
-    @property
-    def ids(self) -> Sequence[str]: ...
-
-    def __len__(self) -> int: ...
-
-    def read(self, index: int) -> Scan | Layout:
-        """One entry."""
-        ...
-
-
 class LayoutFiles:
     """Layouts in YAML files.
 
@@ -56,6 +39,7 @@ class LayoutFiles:
         path: a file, or a folder of them.
 
     Attributes:
+        ids: names of the layouts: those of their files, without suffix.
         others: the file, or visible entries of the folder, that are no YAML files.
     """
 
@@ -79,6 +63,9 @@ class LayoutFiles:
     def read(self, index: int) -> Layout:
         """The layout of one file; raises as ``load_layout``."""
         return load_layout(self._files[index])
+
+
+ConditionSource = LayoutFiles | ScanFiles
 
 
 @lru_cache(maxsize=1)

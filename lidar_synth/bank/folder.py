@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from lidar_synth.bank.facts import REPAIR
 from lidar_synth.bank.index import Entry
@@ -44,47 +44,18 @@ _AT_ONCE = 8  # requests at a time
 _LARGEST = 4 << 30  # bytes that S3 takes with one request, with room for its 5 GB
 
 
-class BankFolder(Protocol):
-    """The files of a bank; names are relative, with / as separator.
+class LocalFolder:
+    """A bank's files in a folder on a disk; names are relative, with / as separator.
 
     Raises:
         FileError: by every method, if a file cannot be read or written.
     """
 
-    def sizes(self) -> dict[str, int]:
-        """The sizes of the files, by name; hidden files of a disk's folder are left out."""
-        ...
-
-    def read(self, name: str) -> bytes: ...
-
-    def write(self, name: str, content: bytes, overwrite: bool = True) -> None:
-        """Write a file. Without ``overwrite``, the first of several processes wins, where the
-        store can tell."""
-        ...
-
-    def put(self, path: Path, name: str) -> None:
-        """Move a file that ``making`` gave to its final name."""
-        ...
-
-    @contextmanager
-    def making(self, name: str) -> Iterator[Path]:
-        """A path for a file that is being made; removed after the block."""
-        ...
-
-    @contextmanager
-    def local(self, name: str, size: int) -> Iterator[Path]:
-        """A path on this machine with a file's bytes; a copy of one at a URL is removed after
-        the block."""
-        ...
-
-
-class LocalFolder:
-    """A folder on a disk; see ``BankFolder``."""
-
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def sizes(self) -> dict[str, int]:
+        """The sizes of the files, by name; hidden files are left out."""
         with reading(self.root, "the folder of a bank"):
             files = [path for path in self.root.glob("[!.]*") if path.is_file()]
             return {path.name: path.stat().st_size for path in files}
@@ -93,16 +64,20 @@ class LocalFolder:
         return read_file(self.root / name, "a file of a bank")
 
     def write(self, name: str, content: bytes, overwrite: bool = True) -> None:
+        """Write a file. Without ``overwrite``, the first of several processes wins, where the
+        store can tell."""
         write_file(self.root / name, content, durable=True, overwrite=overwrite)
         sync_folder(self.root)
 
     def put(self, path: Path, name: str) -> None:
+        """Move a file that ``making`` gave to its final name."""
         with writing(self.root / name):
             path.replace(self.root / name)
         sync_folder(self.root)
 
     @contextmanager
     def making(self, name: str) -> Iterator[Path]:
+        """A path for a file that is being made; removed after the block."""
         part = part_of(self.root / name)
         try:
             yield part
@@ -112,11 +87,13 @@ class LocalFolder:
 
     @contextmanager
     def local(self, name: str, size: int) -> Iterator[Path]:
+        """A path on this machine with a file's bytes; a copy of one at a URL is removed after
+        the block."""
         yield self.root / name
 
 
 class RemoteFolder:
-    """The files below a URL; see ``BankFolder``. Raises as ``RemoteFile``."""
+    """A bank's files below a URL; see ``LocalFolder``. Raises as ``RemoteFile``."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -206,6 +183,9 @@ class RemoteFolder:
         )
         size = found["size"]
         return None if size is None else int(size)
+
+
+BankFolder = LocalFolder | RemoteFolder
 
 
 def open_folder(root: str | Path) -> BankFolder:

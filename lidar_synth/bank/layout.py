@@ -99,7 +99,7 @@ def with_hdf5(
 
     Raises:
         OSError, RuntimeError: from HDF5, if it is not a valid file.
-        FileError, DataError: as ``Storage.read``.
+        FileError, DataError: as ``LocalFile.read``.
     """
     view = RangedFile(
         storage, max(storage.window, 0 if facts is None else head_size(facts, scans))

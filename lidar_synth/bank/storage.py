@@ -9,7 +9,7 @@ import io
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from lidar_synth.bank.retries import PATIENCE, keep_trying
 from lidar_synth.errors import DataError, FileError, LibraryError
@@ -28,37 +28,6 @@ _SYSTEMS: dict[int, Any] = {}
 parent, and with them the parent's connections, while these are in use."""
 
 
-class Storage(Protocol):
-    """A file with random access to byte ranges.
-
-    Attributes:
-        size: size of the file in bytes.
-        window: number of bytes that take about as long to read as a single one.
-    """
-
-    size: int
-    window: int
-
-    def read(self, offset: int, size: int) -> bytes:
-        """``size`` bytes from ``offset``, at least 0.
-
-        Raises:
-            FileError: if they cannot be read.
-            DataError: if the file ends earlier.
-        """
-        ...
-
-    def close(self) -> None: ...
-
-    def reopen(self) -> bool:
-        """Make a closed file readable again; False if it has changed since it was opened.
-
-        Raises:
-            FileError: if it cannot be opened.
-        """
-        ...
-
-
 class _Opened:
     """An open file, closed when nothing refers to it any more: a thread may still read it when
     another one closes its ``LocalFile``."""
@@ -75,7 +44,12 @@ class _Opened:
 
 
 class LocalFile:
-    """A file on this machine; see ``Storage``. A closed one is opened for each ``read``.
+    """A file on this machine, with random access to byte ranges. A closed one is opened for each
+    ``read``.
+
+    Attributes:
+        size: size of the file in bytes.
+        window: number of bytes that take about as long to read as a single one.
 
     Raises:
         FileError: if it cannot be opened.
@@ -102,6 +76,12 @@ class LocalFile:
         return self._opened is not None
 
     def read(self, offset: int, size: int) -> bytes:
+        """``size`` bytes from ``offset``, at least 0.
+
+        Raises:
+            FileError: if they cannot be read.
+            DataError: if the file ends earlier.
+        """
         if offset + size > self.size:
             raise DataError(
                 f"{self._path} ends before byte {offset + size}", "a complete file"
@@ -131,8 +111,8 @@ class LocalFile:
 
 
 class RemoteFile:
-    """A file at a URL that fsspec supports; see ``Storage``. Each ``read`` is one request; opening
-    needs none.
+    """A file at a URL that fsspec supports; see ``LocalFile``. Each ``read`` is one request;
+    opening needs none.
 
     Args:
         url: URL of the file.
@@ -228,6 +208,9 @@ class RemoteFile:
         return b"".join(parts)
 
 
+Storage = LocalFile | RemoteFile
+
+
 def open_system(url: str) -> tuple[Any, str]:
     """The file system of fsspec for a URL, and the path there; raises as ``RemoteFile``."""
     scheme = url.partition("://")[0]
@@ -278,7 +261,7 @@ class RangedFile(io.RawIOBase):
             none.
 
     Raises:
-        FileError, DataError: as ``Storage.read``.
+        FileError, DataError: as ``LocalFile.read``.
     """
 
     def __init__(self, file: Storage, head: int) -> None:
