@@ -7,7 +7,7 @@ need no copies on a CPU.
 
 import math
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -236,7 +236,7 @@ def unfold(x: Tensor, patch: Grid) -> Tensor:
     return x.permute(0, 1, 4, 2, 5, 3).flatten(4).flatten(2, 3)
 
 
-def run(block: nn.Module, checkpointing: bool, *inputs: Tensor | None) -> Tensor:
+def run(block: nn.Module, checkpointing: bool, *inputs: Any) -> Tensor:
     """The output of a block; with ``checkpointing``, its activations are recomputed in the backward
     pass."""
     if checkpointing and torch.is_grad_enabled():
@@ -281,6 +281,21 @@ def check_shape(x: Tensor, shape: tuple[int, ...], what: str) -> None:
         raise DataError(
             f"{what} of shape {tuple(x.shape)}", f"(B, {', '.join(map(str, shape))})"
         )
+
+
+def times_of(t: Tensor | float, y: Tensor) -> Tensor:
+    """(B,) float32 times of the states y (B, ...), from one for each or one for all.
+
+    Raises:
+        DataError: on another number of times.
+    """
+    t = torch.as_tensor(t, dtype=torch.float32, device=y.device)
+    if t.shape not in ((), (1,), (len(y),)):
+        raise DataError(
+            f"times of shape {tuple(t.shape)} for {len(y)} states",
+            "one time per state, or one for all",
+        )
+    return t.expand(len(y))
 
 
 def check_condition(

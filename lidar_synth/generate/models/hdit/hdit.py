@@ -20,11 +20,16 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.models.attention import Grid, NeighbourhoodAttention
-from lidar_synth.generate.models.convolution import check_condition, pair
+from lidar_synth.generate.models.convolution import (
+    check_condition,
+    check_shape,
+    pair,
+    run,
+    times_of,
+)
 from lidar_synth.generate.models.hdit.transformer import (
     Expand,
     Level,
@@ -179,7 +184,7 @@ class HDiT(Network):
                 without them.
         """
         self._check(y, cond)
-        t = _times(t, y)
+        t = times_of(t, y)
         time = self.time(t)
         if end is not None:
             if not self.ends:
@@ -187,7 +192,7 @@ class HDiT(Network):
                     "the end of a step, for a network that was built without ends",
                     "a network with ends",
                 )
-            time = time + self.step(t - _times(end, y))
+            time = time + self.step(t - times_of(end, y))
         angles = self.angles(self.patch, len(self.grids))
         levels = [
             self._level(i, angle, self.tokenize.weight.dtype)
@@ -222,10 +227,7 @@ class HDiT(Network):
 
     def _run(self, blocks: nn.Module, x: Tensor, time: Tensor, level: Level) -> Tensor:
         for block in blocks.children():
-            if self.gradient_checkpointing and torch.is_grad_enabled():
-                x = checkpoint(block, x, time, level, use_reentrant=False)
-            else:
-                x = block(x, time, level)
+            x = run(block, self.gradient_checkpointing, x, time, level)
         return x
 
     def _patches(self, x: Tensor) -> Tensor:
@@ -233,29 +235,13 @@ class HDiT(Network):
         return to_patches(x.movedim(1, -1).to(self.tokenize.weight.dtype), self.patch)
 
     def _check(self, y: Tensor, cond: Tensor | None) -> None:
-        shape = (self.channels, *self.resolution)
-        if y.shape[1:] != shape:
-            raise DataError(
-                f"a state of shape {tuple(y.shape)}",
-                f"(B, {', '.join(map(str, shape))})",
-            )
+        check_shape(y, (self.channels, *self.resolution), "a state")
         check_condition(
             cond,
             len(y),
             (self.condition_channels, *self.resolution),
             self.context_channels,
         )
-
-
-def _times(t: Tensor | float, y: Tensor) -> Tensor:
-    """(B,) float32 times of the states y (B, ...)."""
-    t = torch.as_tensor(t, dtype=torch.float32, device=y.device)
-    if t.shape not in ((), (1,), (len(y),)):
-        raise DataError(
-            f"times of shape {tuple(t.shape)} for {len(y)} states",
-            "one time per state, or one for all",
-        )
-    return t.expand(len(y))
 
 
 def _grids(resolution: Grid, patch: Grid, levels: int) -> list[Grid]:

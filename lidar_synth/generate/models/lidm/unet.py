@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError
 from lidar_synth.generate.models.convolution import (
     GROUPS,
     Attention,
@@ -34,6 +34,7 @@ from lidar_synth.generate.models.convolution import (
     pair,
     reduced,
     run,
+    times_of,
     unfold,
 )
 from lidar_synth.generate.models.network import Network
@@ -188,7 +189,7 @@ class UNet(Network):
         ``forward``."""
         check_shape(y, (self.channels, *self.resolution), "a state")
         dtype = self.head.weight.dtype
-        time = self._time(step, len(y), dtype)
+        time = self._time(times_of(step, y), dtype)
         maps, context = self._condition(y, cond, dtype)
         x = fold(maps.to(dtype), self.patch).contiguous(
             memory_format=torch.channels_last
@@ -221,15 +222,10 @@ class UNet(Network):
         nn.init.zeros_(block.out.bias)
         return block
 
-    def _time(self, step: Tensor, count: int, dtype: torch.dtype) -> Tensor:
+    def _time(self, steps: Tensor, dtype: torch.dtype) -> Tensor:
         """SiLU of the time embedding, (B, 4 width), the first operation of every block."""
-        if step.shape not in ((), (1,), (count,)):
-            raise DataError(
-                f"times of shape {tuple(step.shape)} for {count} states",
-                "one time per state, or one for all",
-            )
-        half = torch.arange(self.width // 2, device=step.device).float()
-        turn = step.float().expand(count)[:, None] * torch.exp(
+        half = torch.arange(self.width // 2, device=steps.device).float()
+        turn = steps[:, None] * torch.exp(
             half * (-math.log(_LONGEST) / (self.width // 2))
         )
         return nn.functional.silu(
