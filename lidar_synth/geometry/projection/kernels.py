@@ -147,21 +147,6 @@ def row_of(elevation, up, down, rows):  # type: ignore[no-untyped-def]
 
 
 @_inlined
-def row_in_table(elevation, edges):  # type: ignore[no-untyped-def]
-    """Row of an elevation (radians) between tabulated edges; the first or last row outside the
-    field of view."""
-    low = 1
-    high = len(edges) - 1
-    while low < high:
-        middle = (low + high) // 2
-        if elevation <= edges[middle]:
-            low = middle + 1
-        else:
-            high = middle
-    return np.int32(low - 1)
-
-
-@_inlined
 def row_of_lasers(z, flat, slopes, lifts):  # type: ignore[no-untyped-def]
     """Row of a point at height z and horizontal distance ``flat`` (metres) between edges that start
     above the origin; the first or last row outside the field of view."""
@@ -210,10 +195,10 @@ def _locate_block(x, y, z, grid, cell, distance):  # type: ignore[no-untyped-def
     elif len(grid.edges) > 0:
         for i in range(len(x)):
             if distance[i] < _INF:
-                cell[i] = (
-                    cell[i] % columns
-                    + row_in_table(asin(z[i] / distance[i]), grid.edges) * columns
-                )
+                # At no distance, lasers' edges are where they start: here, the elevations.
+                elevation = asin(z[i] / distance[i])
+                row = row_of_lasers(elevation, _ZERO, grid.edges, grid.edges)
+                cell[i] = cell[i] % columns + row * columns
 
 
 @numba.njit(error_model="numpy", cache=True, inline="always")
