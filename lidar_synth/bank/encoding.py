@@ -82,7 +82,7 @@ class Encoding:
         return {
             name: (
                 SHAPE if name == "boxes" else self.sensor.shape,
-                np.dtype(TYPES[name]),
+                np.dtype(TYPES[name]).newbyteorder("<"),
             )
             for name in self.names
         }

@@ -228,7 +228,7 @@ def _chunks(
     """The addresses of an array's chunks, after checking how it is stored."""
     properties = dataset.id.get_create_plist()
     kind = dataset.id.get_type()
-    if not _is(dtype.newbyteorder("<"))(kind) or dataset.shape != (scans, *shape):
+    if not _is(dtype)(kind) or dataset.shape != (scans, *shape):
         raise ValueError(
             f"{dataset.name} is {dataset.shape} of {_type_name(kind)}, not {(scans, *shape)} of "
             f"{dtype.name}"

@@ -59,7 +59,7 @@ class ShardWriter:
         self._conditions = [name.encode() for name in conditions]
         self._crc = np.zeros(entry.scans, np.uint32)
         self._next = 0
-        self._waiting: deque[Future[tuple[int, dict[str, bytes]]]] = deque()
+        self._waiting: deque[Future[tuple[int, dict[str, Any]]]] = deque()
         self._pool = ThreadPoolExecutor(threads, "compress")
         self._limit = _PENDING * threads
         with _on_disk(path):
@@ -85,7 +85,7 @@ class ShardWriter:
     def append_chunks(self, chunks: Mapping[str, bytes], crc: int) -> None:
         """Add the next scan as compressed chunks from another shard with the same facts."""
         self._write_ready(0)
-        self._put(self._next, crc, chunks, ready=True)
+        self._put(self._next, crc, chunks)
         self._next += 1
 
     def close(self) -> None:
@@ -164,7 +164,7 @@ class ShardWriter:
             name: self._file.create_dataset(
                 name,
                 (self.entry.scans, *shape),
-                dtype.newbyteorder("<"),
+                dtype,
                 chunks=(1, *shape),
                 fletcher32=True,
                 track_times=False,
@@ -173,49 +173,30 @@ class ShardWriter:
             for name, (shape, dtype) in self.encoding.arrays().items()
         }
 
-    def _pack(self, position: int, image: RangeImage) -> tuple[int, dict[str, bytes]]:
-        """CRC and chunks of a scan; runs in a thread."""
+    def _pack(self, position: int, image: RangeImage) -> tuple[int, dict[str, Any]]:
+        """CRC and chunks or plain arrays of a scan; runs in a thread."""
         arrays = self.encoding.encode(image)
-        plain = {
-            name: arrays[name].astype(dtype, copy=False)
-            for name, dtype in self._types().items()
-        }
         condition = self._conditions[position] if self._conditions else b""
-        crc = checksum(self.entry.seed, self.entry.first + position, plain, condition)
+        crc = checksum(self.entry.seed, self.entry.first + position, arrays, condition)
         return crc, {
-            name: deflate(a) if self._direct else a.tobytes()
-            for name, a in plain.items()
-        }
-
-    def _types(self) -> dict[str, np.dtype[Any]]:
-        return {
-            name: dtype.newbyteorder("<")
-            for name, (_, dtype) in self.encoding.arrays().items()
+            name: deflate(a) if self._direct else a for name, a in arrays.items()
         }
 
     def _write_ready(self, keep: int) -> None:
         """Write scans, in order, until no more than ``keep`` wait."""
         while len(self._waiting) > keep:
             crc, chunks = self._waiting.popleft().result()
-            self._put(
-                self._next - len(self._waiting) - 1, crc, chunks, ready=self._direct
-            )
+            self._put(self._next - len(self._waiting) - 1, crc, chunks)
 
-    def _put(
-        self, position: int, crc: int, chunks: Mapping[str, bytes], ready: bool
-    ) -> None:
-        """Write a scan: compressed chunks if ``ready``, otherwise plain arrays, which HDF5
-        compresses."""
+    def _put(self, position: int, crc: int, chunks: Mapping[str, Any]) -> None:
+        """Write a scan: compressed chunks, or plain arrays, which HDF5 compresses."""
         self._crc[position] = crc
         with _on_disk(self.path):
             for name, chunk in chunks.items():
-                if ready:
+                if isinstance(chunk, bytes):
                     self._datasets[name].id.write_direct_chunk((position, 0, 0), chunk)
                 else:
-                    shape, _ = self.encoding.arrays()[name]
-                    self._datasets[name][position] = np.frombuffer(
-                        chunk, self._types()[name]
-                    ).reshape(shape)
+                    self._datasets[name][position] = chunk
 
 
 def _create(name: str, facts: Facts, scans: int) -> h5py.File:
