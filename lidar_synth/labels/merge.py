@@ -94,20 +94,20 @@ def _of_tracks(scan: Scan) -> NDArray[np.int32]:
     return instance
 
 
-def _numbers(scan: Scan) -> list[NDArray[np.int32]]:
+def instance_numbers(scan: Scan) -> list[NDArray[np.int32]]:
     """The instance numbers of points and boxes."""
     of_points = [] if scan.instance is None else [scan.instance]
     return of_points if scan.boxes is None else [*of_points, scan.boxes.instance]
 
 
 def _last_instance(scan: Scan) -> int:
-    return max(int(n.max(initial=0)) for n in _numbers(scan))
+    return max(int(n.max(initial=0)) for n in instance_numbers(scan))
 
 
 def _renumbered(scan: Scan, used: int) -> Scan:
     """Renumber the scan's instances as used + 1, used + 2, ...; 0 and below, which mean none, are
     kept."""
-    old = np.unique(np.concatenate(_numbers(scan)))
+    old = np.unique(np.concatenate(instance_numbers(scan)))
     old = old[old > 0]
 
     def new(numbers: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import MAX_INSTANCES, SEMANTIC_KITTI
 from lidar_synth.geometry import SYNTHETIC, Scan
 from lidar_synth.labels.edit.rays import ScanRays
+from lidar_synth.labels.merge import instance_numbers
 
 
 def replace_returns(
@@ -54,9 +55,7 @@ def replace_returns(
 def next_instance(scan: Scan) -> int:
     """The first instance number that neither points nor boxes of a scan have, in any class of
     KITTI-360, whose numbers are id * ``MAX_INSTANCES`` + n."""
-    numbers = [] if scan.instance is None else [scan.instance]
-    numbers += [] if scan.boxes is None else [scan.boxes.instance]
-    used = np.unique(np.concatenate([[0], *numbers]))
+    used = np.unique(np.concatenate([[0], *instance_numbers(scan)]))
     taken = np.concatenate([used, used % MAX_INSTANCES])
     return int(np.setdiff1d(np.arange(len(taken) + 1), taken)[0])
 

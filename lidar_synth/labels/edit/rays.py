@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry import Scan
+from lidar_synth.geometry import Boxes, Scan
 from lidar_synth.geometry.arrays import Float64Array
 from lidar_synth.geometry.transfer.kernels import WIDEST
 from lidar_synth.geometry.transfer.surfaces import as_fired, rings_of
@@ -51,8 +51,7 @@ class ScanRays(NamedTuple):
     def through(self, box: NDArray[np.float32], margin: float) -> NDArray[np.bool_]:
         """(E,) whether each ray passes through a box (7,) with a margin in metres on all six
         sides."""
-        sides = 3 * [2 * margin]
-        wide = box + np.array([0, 0, 0, *sides, 0], np.float32)
+        [wide] = Boxes(box, ("Misc",)).enlarged(margin).values
         return np.asarray(self.leaving(wide) > 0)
 
     def leaving(self, box: NDArray[np.float32]) -> Float64Array:
