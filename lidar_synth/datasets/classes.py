@@ -54,7 +54,7 @@ GROUND = np.isin(
 """(256,) whether a label, uint8, is of the ground."""
 
 
-def check_labels(labels: NDArray[np.integer], where: str) -> None:
+def check_labels(labels: NDArray[Any], where: str, hint: str = "") -> None:
     """Refuse labels that are not train ids, with ``where`` before the message.
 
     Raises:
@@ -65,6 +65,7 @@ def check_labels(labels: NDArray[np.integer], where: str) -> None:
         raise DataError(
             f"{where}: labels {np.unique(labels[~known])[:8].tolist()}",
             "train ids 0..18, or 255 = ignore",
+            hint,
         )
 
 

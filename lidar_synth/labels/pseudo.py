@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import check_labels
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry import Scan
 from lidar_synth.labels.own import check_share, trust_labels
@@ -68,19 +68,15 @@ class PredictLabels:
             )
         label = np.asarray(answer[0])
         confidence = None if answer[1] is None else np.asarray(answer[1])
-        if not (_are_labels(label, len(scan)) and _are_shares(confidence, len(scan))):
+        if label.shape != (len(scan),) or not _are_shares(confidence, len(scan)):
             raise DataError(
                 f"the teacher's labels of scan {scan.id!r}, {label.shape} for {len(scan)} points",
                 "train ids 0..18 or 255 and confidences in [0, 1], one of each per point",
             )
+        check_labels(label, f"the teacher's answer for scan {scan.id!r}")
         if confidence is not None:
             confidence = confidence.astype(np.float32)
         return trust_labels(scan, label.astype(np.uint8), confidence, self.threshold)
-
-
-def _are_labels(label: NDArray[Any], count: int) -> bool:
-    known = (label >= 0) & (label < len(NAMES))
-    return label.shape == (count,) and bool((known | (label == IGNORE)).all())
 
 
 def _are_shares(confidence: NDArray[Any] | None, count: int) -> bool:

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidar_synth.datasets.classes import IGNORE, NAMES
-from lidar_synth.errors import DataError
+from lidar_synth.datasets.classes import IGNORE, check_labels
 from lidar_synth.geometry import Scan
 
 
@@ -52,14 +51,8 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
         label = np.full(len(scan), IGNORE, np.int64)
     else:
         label = scan.label.astype(np.int64)
-        valid = (scan.label >= 0) & (scan.label < len(NAMES))
-        wrong = ~valid & (scan.label != IGNORE)
-        if wrong.any():
-            raise DataError(
-                f"scan {scan.id!r}: labels {np.unique(label[wrong])[:8].tolist()}",
-                f"train ids 0..{len(NAMES) - 1}, or {IGNORE} = ignore",
-                "Map the dataset's own ids when they are read (Taxonomy.decode).",
-            )
+        hint = "Map the dataset's own ids when they are read (Taxonomy.decode)."
+        check_labels(scan.label, f"scan {scan.id!r}", hint)
     if scan.confidence is None:
         confidence = (label != IGNORE).astype(np.float32)
     else:
