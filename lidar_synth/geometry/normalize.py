@@ -240,6 +240,11 @@ class TensorFormat:
         """C, the number of channels of the tensor."""
         return sum(CHANNELS[name] for name in self.channels)
 
+    def parts(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The channels of a tensor (B, C, H, W) by name, (B, channels of it, H, W) each."""
+        sizes = [CHANNELS[name] for name in self.channels]
+        return dict(zip(self.channels, torch.split(x, sizes, 1), strict=True))
+
     def encode(self, fields: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Encode the fields of range images as a tensor.
 
@@ -287,13 +292,7 @@ class TensorFormat:
             raise DataError(
                 f"a tensor for {self.channels} with NaN or infinity", "finite values"
             )
-        part = dict(
-            zip(
-                self.channels,
-                torch.split(x.float(), [CHANNELS[name] for name in self.channels], 1),
-                strict=True,
-            )
-        )
+        part = self.parts(x.float())
         fields = {"range": self.normalisation.decode(part["range"][:, 0])}
         empty = fields["range"] == 0
         if "reflectance" in part:

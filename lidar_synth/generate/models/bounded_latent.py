@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.generate.models.codebook import follow
 from lidar_synth.generate.models.convolution import WrapConv, check_shape
-from lidar_synth.generate.models.layers import rms_norm
+from lidar_synth.generate.models.layers import cell_norm
 from lidar_synth.generate.models.network import Autoencoder
 from lidar_synth.generate.models.objective import Objective
 from lidar_synth.geometry.normalize import encode_labels
@@ -34,8 +34,7 @@ class NormedResidual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) to the same shape."""
-        normed = rms_norm(x.movedim(1, -1)).movedim(-1, 1)
-        out: Tensor = x + self.second(F.silu(self.first(normed)))
+        out: Tensor = x + self.second(F.silu(self.first(cell_norm(x))))
         return out
 
 
@@ -48,8 +47,6 @@ class BoundedAutoencoder(Autoencoder):
     """
 
     bits: int
-    shift: Tensor
-    scale: Tensor
 
     def add_encoder(
         self,
@@ -78,10 +75,7 @@ class BoundedAutoencoder(Autoencoder):
             *(NormedResidual(inner) for _ in range(depth))
         )
         self.to_latent = nn.Conv2d(inner, latent_channels, 1)
-        # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise
-        # needs.
-        self.register_buffer("shift", torch.zeros(latent_channels))
-        self.register_buffer("scale", torch.ones(latent_channels))
+        self.add_scale(latent_channels)
 
     @abstractmethod
     def embed(self, x: Tensor) -> Tensor:
@@ -152,18 +146,9 @@ class BoundedAutoencoder(Autoencoder):
     def encode(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of
         mean 0 and variance 1 per channel."""
-        return (self.squeeze(x) - _channel(self.shift)) / _channel(self.scale)
-
-    def bounded(self, z: Tensor) -> Tensor:
-        """Normalised latents (B, *latent_shape) back to the bounded ones of ``squeeze``."""
-        return z * _channel(self.scale) + _channel(self.shift)
+        return self.normed(self.squeeze(x))
 
 
 def row_bias(channels: int, rows: int) -> nn.Parameter:
     """(1, C, rows, 1), the same in all columns."""
     return nn.Parameter(torch.zeros(1, channels, rows, 1))
-
-
-def _channel(x: Tensor) -> Tensor:
-    """(Z,) as (1, Z, 1, 1)."""
-    return x.view(1, -1, 1, 1)

@@ -55,6 +55,11 @@ def rms_norm(x: Tensor, eps: float = EPS) -> Tensor:
     return out
 
 
+def cell_norm(x: Tensor) -> Tensor:
+    """RMS norm over the channels of each cell of (B, C, H, W)."""
+    return rms_norm(x.movedim(1, -1)).movedim(-1, 1)
+
+
 class Exact(nn.Module):
     """A module whose buffers stay float32 when the network is cast to half precision.
 

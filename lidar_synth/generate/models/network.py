@@ -5,6 +5,7 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
 from lidar_synth.generate.models.objective import Objective
@@ -46,6 +47,22 @@ class Autoencoder(Network):
     resolution: tuple[int, int]
     latent_shape: tuple[int, int, int]
     draws: int
+    shift: Tensor
+    scale: Tensor
+
+    def add_scale(self, channels: int) -> None:
+        """Add the buffers by which latents have mean 0 and variance 1 per channel, as a flow from
+        standard normal noise needs."""
+        self.register_buffer("shift", torch.zeros(channels))
+        self.register_buffer("scale", torch.ones(channels))
+
+    def normed(self, z: Tensor) -> Tensor:
+        """Latents (B, *latent_shape) with mean 0 and variance 1."""
+        return (z - self.shift[:, None, None]) / self.scale[:, None, None]
+
+    def bounded(self, z: Tensor) -> Tensor:
+        """The inverse of ``normed``."""
+        return z * self.scale[:, None, None] + self.shift[:, None, None]
 
     @abstractmethod
     def encode(self, x: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
+from lidar_synth.geometry.normalize import TensorFormat
 
 CURVE_LENGTH = 4
 """Number of neighbouring cells in a row whose points are averaged, as in LiDM."""
@@ -80,17 +80,11 @@ class Objective:
 
     def reconstruction(self, output: Tensor, x: Tensor) -> Tensor:
         """The weighted sum over channels, a scalar: the metric, or cross-entropy of label bits."""
-        sizes = [CHANNELS[name] for name in self.tensors.channels]
         loss = output.new_zeros(())
-        parts = zip(
-            self.tensors.channels,
-            output.split(sizes, 1),  # type: ignore[no-untyped-call]
-            x.split(sizes, 1),  # type: ignore[no-untyped-call]
-            strict=True,
-        )
-        for name, a, b in parts:
+        wanted = self.tensors.parts(x)
+        for name, given in self.tensors.parts(output).items():
             error = _cross_entropy if name == "label" else self.metric
-            part = error(a, b).mean()
+            part = error(given, wanted[name]).mean()
             loss = loss + self.weights.get(name, 1.0) * part
         return loss
 
@@ -104,9 +98,7 @@ class Objective:
 
     def _metres(self, x: Tensor) -> Tensor:
         """(B, 1, H, W) ranges."""
-        before = self.tensors.channels[: self.tensors.channels.index("range")]
-        first = sum(CHANNELS[name] for name in before)
-        return self.tensors.normalisation.decode(x[:, first : first + 1])
+        return self.tensors.normalisation.decode(self.tensors.parts(x)["range"])
 
 
 def _cross_entropy(logits: Tensor, bits: Tensor) -> Tensor:
@@ -117,11 +109,7 @@ def _cross_entropy(logits: Tensor, bits: Tensor) -> Tensor:
 def expected(output: Tensor, tensors: TensorFormat) -> Tensor:
     """The expected values of a decoder's output (B, C, H, W): label bits x, which are logits,
     become tanh(x / 2) in (-1, 1); other channels are unchanged."""
-    parts = torch.split(output, [CHANNELS[name] for name in tensors.channels], 1)
-    return torch.cat(
-        [
-            (p / 2).tanh() if n == "label" else p
-            for n, p in zip(tensors.channels, parts, strict=True)
-        ],
-        1,
-    )
+    parts = tensors.parts(output)
+    if "label" in parts:
+        parts["label"] = (parts["label"] / 2).tanh()
+    return torch.cat(list(parts.values()), 1)

@@ -98,9 +98,6 @@ class VQVAE(Autoencoder):
         ConfigError: on values that do not fit together.
     """
 
-    shift: Tensor
-    scale: Tensor
-
     def __init__(
         self,
         resolution: Sequence[int],
@@ -150,15 +147,12 @@ class VQVAE(Autoencoder):
         self.from_latent = nn.Conv2d(latent_channels, latent_channels, 1)
         self.decoder = Decoder(cells * (channels + mask), latent_channels, *levels)
         self.codebook = Codebook(codes, latent_channels)
-        # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise
-        # needs.
-        self.register_buffer("shift", torch.zeros(latent_channels))
-        self.register_buffer("scale", torch.ones(latent_channels))
+        self.add_scale(latent_channels)
 
     def encode(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) to latents before the codebook, (B, *latent_shape), mean 0 and
         variance 1 per channel."""
-        return (self._encode(x) - _channel(self.shift)) / _channel(self.scale)
+        return self.normed(self._encode(x))
 
     def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         """Latents (B, *latent_shape), quantised, to images (B, C, H, W), with -1 where the mask
@@ -167,9 +161,7 @@ class VQVAE(Autoencoder):
         ``uniform_noise`` is ignored, since decoding is deterministic.
         """
         check_shape(z, self.latent_shape, "a latent")
-        z = z.to(self.to_latent.weight.dtype) * _channel(self.scale) + _channel(
-            self.shift
-        )
+        z = self.bounded(z.to(self.to_latent.weight.dtype))
         output = self._decode(self.codebook(z)[0])
         if self.mask:
             return torch.where(
@@ -393,8 +385,3 @@ def _middle(channels: int, attention: bool, groups: int) -> nn.Sequential:
     return nn.Sequential(
         first, *([Attention(channels, groups=groups)] if attention else []), last
     )
-
-
-def _channel(x: Tensor) -> Tensor:
-    """(K,) as (1, K, 1, 1)."""
-    return x.view(1, -1, 1, 1)

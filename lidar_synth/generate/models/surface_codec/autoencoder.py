@@ -15,11 +15,11 @@ from torch import Tensor, nn
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder, row_bias
 from lidar_synth.generate.models.convolution import check_shape, pair, reduced
+from lidar_synth.generate.models.layers import cell_norm
 from lidar_synth.generate.models.objective import Objective
 from lidar_synth.generate.models.surface_codec.blocks import (
     PATCH,
     Block,
-    cell_norm,
     from_patches,
     split,
     to_patches,

@@ -4,8 +4,8 @@ wrap around."""
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidar_synth.generate.models.convolution import WrapConv
-from lidar_synth.generate.models.layers import rms_norm
+from lidar_synth.generate.models.convolution import WrapConv, fold, to_tokens, unfold
+from lidar_synth.generate.models.layers import cell_norm
 
 PATCH = (2, 8)
 """Rows and columns of a patch."""
@@ -32,11 +32,6 @@ class Block(nn.Module):
         return out
 
 
-def cell_norm(x: Tensor) -> Tensor:
-    """RMS norm over the channels of each cell of (B, C, H, W)."""
-    return rms_norm(x.movedim(1, -1)).movedim(-1, 1)
-
-
 def split(x: Tensor, patch: tuple[int, int]) -> Tensor:
     """(B, P C, h, w), P cells of a patch first, to (B, C, h rows, w columns)."""
     batch, _, h, w = x.shape
@@ -46,11 +41,7 @@ def split(x: Tensor, patch: tuple[int, int]) -> Tensor:
 
 def to_patches(x: Tensor, patch: tuple[int, int]) -> Tensor:
     """(B, C, H, W) to (N, C, P), all patches of all images row by row, P = rows * columns."""
-    batch, channels, height, width = x.shape
-    x = x.reshape(
-        batch, channels, height // patch[0], patch[0], width // patch[1], patch[1]
-    )
-    return x.permute(0, 2, 4, 1, 3, 5).reshape(-1, channels, patch[0] * patch[1])
+    return to_tokens(fold(x, patch)).reshape(-1, x.shape[1], patch[0] * patch[1])
 
 
 def from_patches(
@@ -59,5 +50,5 @@ def from_patches(
     """The inverse of ``to_patches``."""
     rows = resolution[0] // patch[0]
     columns = resolution[1] // patch[1]
-    x = x.reshape(-1, rows, columns, x.shape[1], *patch)
-    return x.permute(0, 3, 1, 4, 2, 5).reshape(len(x), -1, *resolution)
+    cells = x.reshape(-1, rows, columns, x.shape[1] * x.shape[2])
+    return unfold(cells.movedim(-1, 1), patch)
