@@ -54,16 +54,19 @@ class Condition(ABC):
         field: field of ``train.ImageCache`` that stores it.
         turns: whether it has to be rotated when the scan is rotated about the vertical.
         blank: value of a blank condition.
+        channels: what its shape has before the rows and columns of the encoder.
     """
 
     name: str
     field: str
     turns = True
     blank = 0
+    channels: tuple[int, ...] = ()
 
-    @abstractmethod
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
         """The shape of one condition."""
+        # Every encoder has a resolution.
+        return (*self.channels, *encoder.resolution)  # type: ignore[misc]
 
     @abstractmethod
     def read(
@@ -117,10 +120,6 @@ class SemanticMap(Condition):
     field = "label"
     blank = IGNORE
 
-    def shape(self, encoder: nn.Module) -> tuple[int, ...]:
-        """(H, W)."""
-        return tuple(encoder.resolution)  # type: ignore[arg-type]  # every encoder has a resolution
-
     def read(
         self,
         scan: Scan,
@@ -167,10 +166,7 @@ class CameraImage(Condition):
     name = "camera"
     field = "camera"
     turns = False
-
-    def shape(self, encoder: nn.Module) -> tuple[int, ...]:
-        """(3, h, w)."""
-        return (3, *encoder.resolution)  # type: ignore[misc]  # every encoder has a resolution
+    channels = (3,)
 
     def read(
         self,
@@ -258,11 +254,7 @@ class LayoutImage(Condition):
 
     name = "layout"
     field = "layout"
-
-    def shape(self, encoder: nn.Module) -> tuple[int, ...]:
-        """(5, H, W)."""
-        # Every encoder has a resolution.
-        return (len(CHANNELS), *encoder.resolution)  # type: ignore[misc]
+    channels = (len(CHANNELS),)
 
     def read(
         self,
