@@ -125,11 +125,10 @@ def check_shard(folder: BankFolder, facts: Facts, entry: Entry) -> Iterator[Prob
         yield Problem(entry.file, f"cannot be read ({error.strerror or error})")
 
 
-def check_scans(path: Path, facts: Facts | None, entry: Entry | None) -> Iterator[str]:
+def check_scans(path: Path, facts: Facts, entry: Entry) -> Iterator[str]:
     """Descriptions of the problems of a shard's attributes and scans."""
-    name = path.name if entry is None else entry.file
     try:
-        with ShardReader(path, name, facts, entry) as shard:
+        with ShardReader(path, entry.file, facts, entry) as shard:
             for position in range(shard.entry.scans):
                 try:
                     shard.read(position)
