@@ -23,8 +23,8 @@ from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry import RangeImage, Sensor
 
 START = 0.6
-"""Default time from which the flow starts in a hole; the large shapes of the provisional content
-remain."""
+"""Time from which the flow starts in a hole, so that the large shapes of the provisional content
+remain. The steps are those of the model's time grid from the last time at or below it."""
 
 
 def inpaint(
@@ -33,7 +33,6 @@ def inpaint(
     holes: Sequence[NDArray[np.bool_]],
     seed: int,
     indices: Sequence[int],
-    start: float = START,
 ) -> list[RangeImage]:
     """Draw the holes of range images again.
 
@@ -44,16 +43,13 @@ def inpaint(
         holes: (H, W) each, True for cells to draw.
         seed: seed of the noise, 0 <= seed < 2^64.
         indices: B indices of the noise, 0 <= index < 2^63.
-        start: time in (0, 1] from which the flow starts: 1 ignores the provisional content, less
-            keeps its large shapes. The steps are those of the model's time grid from the last time
-            at or below it.
 
     Returns:
         B images: outside the holes the given values, inside those of the model, with ``confidence``
             if it has labels.
 
     Raises:
-        ConfigError: on a conditional model, or a start outside (0, 1].
+        ConfigError: on a conditional model, or one without a time in (0, ``START``].
         DataError: on images of another sensor.
 
     Example:
@@ -66,15 +62,13 @@ def inpaint(
         >>> bool((drawn.range[~hole] == image.range[~hole]).all())
         True
     """
-    if not 0 < start <= 1:
-        raise ConfigError(f"start={start}", "a time in (0, 1]")
     for image in images:
         check_model(generator, image.sensor)
     drawn = []
     for first in range(0, len(images), generator.batch):
         part = slice(first, first + generator.batch)
         drawn += _inpaint_batch(
-            generator, images[part], holes[part], seed, indices[part], start
+            generator, images[part], holes[part], seed, indices[part]
         )
     return drawn
 
@@ -110,7 +104,6 @@ def _inpaint_batch(
     holes: Sequence[NDArray[np.bool_]],
     seed: int,
     indices: Sequence[int],
-    start: float,
 ) -> list[RangeImage]:
     """``inpaint`` for the images of one batch."""
     codec = generator.codec
@@ -122,7 +115,7 @@ def _inpaint_batch(
     noise, draws = generator.draw_noise(seed, indices, sensor)
     with torch.inference_mode(), without_autocast(device):
         known = codec.encode(generator.tensors.from_images(images).to(device))
-        state = codec.decode(_sample(generator, known, noise, inside, start), draws)
+        state = codec.decode(_sample(generator, known, noise, inside), draws)
     results = []
     for image, hole, new in zip(
         images, holes, generator.tensors.to_images(state, sensor), strict=True
@@ -137,7 +130,7 @@ def _inpaint_batch(
 
 
 def _sample(
-    generator: Generator, known: Tensor, noise: Tensor, inside: Tensor, start: float
+    generator: Generator, known: Tensor, noise: Tensor, inside: Tensor
 ) -> Tensor:
     """The states (B, *shape) at time 0, which outside the hole are the known ones.
 
@@ -145,13 +138,12 @@ def _sample(
         generator: the model.
         known, noise: (B, *shape) encoded images, and noise.
         inside: (B, 1, h, w) bool, True for the cells of a state to sample.
-        start: as for ``inpaint``.
     """
-    grid = [t for t in generator.header.time_grid if t <= start]
+    grid = [t for t in generator.header.time_grid if t <= START]
     if len(grid) < 2:
         raise ConfigError(
-            f"start={start} for the time grid {tuple(generator.header.time_grid)}",
-            "a later time in it",
+            f"the time grid {tuple(generator.header.time_grid)}, to fill holes",
+            f"a time above 0 and up to {START} in it, at which to start",
         )
     y = (1 - grid[0]) * known + grid[0] * noise
     velocity = mean_velocity(generator.network, grid)
