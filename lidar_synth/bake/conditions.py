@@ -70,7 +70,7 @@ ConditionSource = LayoutFiles | ScanFiles
 
 @lru_cache(maxsize=1)
 def open_conditions(
-    path: str | None, layout: str | None = None, split: str | None = None
+    path: str | None, layout: str | None, split: str | None
 ) -> ConditionSource | None:
     """The dataset of the conditions, opened once per process; None without a path.
 

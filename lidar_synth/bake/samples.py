@@ -36,7 +36,7 @@ _ELSEWHERE = {
 
 
 def write_samples(
-    out: Path, job: Drawing, to: str, times: Sequence[float] | None = None
+    out: Path, job: Drawing, to: str, times: Sequence[float] | None
 ) -> Report:
     """Write those of a job's scans that are missing in a folder.
 
@@ -44,7 +44,7 @@ def write_samples(
         out: the folder.
         job: the settings.
         to: the format, a key of ``WRITERS``.
-        times: the time grid, instead of the job's steps.
+        times: the time grid, instead of the job's steps; None = these.
 
     Raises:
         ConfigError: as ``Writer.hold``, ``load_generator``, ``conditions_for`` and

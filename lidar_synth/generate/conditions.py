@@ -198,7 +198,7 @@ def resize_image(
     image: "PILImage",
     shape: tuple[int, ...],
     options: Mapping[str, Any],
-    what: str = "an image",
+    what: str,
 ) -> NDArray[np.uint8]:
     """A camera image as a condition.
 

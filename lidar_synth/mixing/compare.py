@@ -65,7 +65,7 @@ def check_alike(
     real: Sequence[Any],
     synthetic: Sequence[Synthetic],
     finish: Callable[[int, Scan, np.random.Generator], Any],
-    weighs: bool = False,
+    weighs: bool,
 ) -> None:
     """Compare a trainer's first sample with one synthetic sample of each source, then what several
     samples mean.

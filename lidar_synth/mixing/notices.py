@@ -58,9 +58,7 @@ class Notices:
 
     segments = False
 
-    def __init__(
-        self, images: bool = False, boxes: bool = False, boxed: bool = False
-    ) -> None:
+    def __init__(self, images: bool, boxes: bool, boxed: bool) -> None:
         self._real_boxes = boxes  # whether real scans have boxes, or should
         # One bit for each logged message, shared by all processes, so that no epoch repeats it.
         self._logged = shared_integers(0)

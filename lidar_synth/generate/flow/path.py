@@ -148,10 +148,10 @@ def u_shaped(u: Tensor, sharpness: float = 4.0) -> Tensor:
     return 0.5 + torch.asinh((2 * u - 1) * math.sinh(sharpness / 2)) / sharpness
 
 
-def logit_normal(u: Tensor, mean: float = 0.0, std: float = 1.0) -> Tensor:
+def logit_normal(u: Tensor, mean: float = 0.0) -> Tensor:
     """t = sigmoid(n) with normally distributed n (Esser et al., "Scaling Rectified Flow
     Transformers", ICML 2024)."""
-    return torch.sigmoid(mean + std * torch.special.ndtri(u))
+    return torch.sigmoid(mean + torch.special.ndtri(u))
 
 
 TIMESTEPS: dict[str, Callable[[Tensor], Tensor]] = {

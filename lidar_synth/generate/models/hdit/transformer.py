@@ -156,7 +156,7 @@ class TransformerBlock(nn.Module):
     """
 
     def __init__(
-        self, dim: int, embedding: int, heads: int, ratio: float, context: int = 0
+        self, dim: int, embedding: int, heads: int, ratio: float, context: int
     ) -> None:
         super().__init__()
         self.attention = SelfAttention(dim, embedding, heads)

@@ -19,7 +19,7 @@ SPANS = 4, 16
 """Columns between the independent values of the fields. Each divides the columns of any image."""
 
 
-def relief_fields(uniform_noise: Tensor, merged: int = 1) -> Tensor:
+def relief_fields(uniform_noise: Tensor, merged: int) -> Tensor:
     """The fields of relief.
 
     Args:
