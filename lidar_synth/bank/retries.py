@@ -27,7 +27,7 @@ def keep_trying(url: str, what: str, request: Callable[[], T]) -> T:
 
     Args:
         url: URL of the file.
-        what: "read" or "written", for the error.
+        what: "read", "written" or "listed", for the error.
         request: makes the request.
 
     Raises:
