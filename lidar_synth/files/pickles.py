@@ -260,16 +260,10 @@ class _OpenMachine(_Machine):
         self.call_of(name, args if isinstance(args, tuple) else ())
 
     def call_of(self, name: Any, args: Any) -> None:
-        self.stack.append(
-            Call(name.text if isinstance(name, Name) else _text(name), tuple(args))
-        )
+        self.stack.append(Call(_text(name), tuple(args)))
 
-    def call_since_mark(self, name: Any) -> None:
-        name, *args = (
-            self.since_mark()
-            if name is None
-            else [Name(name.replace(" ", ".")), *self.since_mark()]
-        )
+    def call_since_mark(self, _: Any) -> None:
+        name, *args = self.since_mark()
         self.call_of(name, args)
 
     def build(self, _: Any) -> None:
@@ -351,8 +345,8 @@ _OPEN_STEPS: dict[str, Callable[[_OpenMachine, Any], object]] = {
     "PERSID": lambda m, argument: m.call_of(Name(PERSISTENT), (argument,)),
     "BINPERSID": lambda m, _: m.call_of(Name(PERSISTENT), (m.stack.pop(),)),
     "NEWOBJ_EX": lambda m, _: m.call(m.stack.pop()),  # without the arguments by name
-    "INST": lambda m, argument: m.call_since_mark(argument),
-    "OBJ": lambda m, _: m.call_since_mark(None),
+    "INST": lambda m, text: m.call_of(Name(text.replace(" ", ".")), m.since_mark()),
+    "OBJ": _OpenMachine.call_since_mark,
     "EMPTY_SET": lambda m, _: m.stack.append([]),
     "ADDITEMS": lambda m, _: m.extend(m.since_mark()),
     "FROZENSET": lambda m, _: m.push_since_mark(list),
