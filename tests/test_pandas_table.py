@@ -316,6 +316,15 @@ def test_a_long_pickle_is_refused_before_its_end() -> None:
         parse_pickle(content, (), "x", "y")
 
 
+def test_keys_and_arguments_take_no_more_than_their_opcodes() -> None:
+    """Deep tuples are not hashed, and arguments of several calls are not copied."""
+    deep = b"\x80\x04})" + b"\x85" * (MOST_STEPS // 2) + b"Ns."
+    assert parse_pickle(deep, None, "x", "y") == {"tuple": None}
+    twice = b"\x80\x04(NNNNt\x940" + b"(" + 2 * b"ca\nb\nh\0R" + b"l."
+    first, second = parse_pickle(twice, {"a.b"}, "x", "y")
+    assert first.args is second.args
+
+
 def test_names_that_are_known_are_not_imported() -> None:
     """A name stays text even where its module could not be imported."""
     tree = parse_pickle(call("nowhere.at.all", 1, "a"), {"nowhere.at.all"}, "x", "y")
