@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.errors import DataError
+from lidar_synth.generate.models.convolution import check_shape
 from lidar_synth.generate.models.network import Autoencoder
 from lidar_synth.generate.models.objective import expected
 from lidar_synth.generate.support import find_unsupported
@@ -125,11 +126,7 @@ class Latent:
         Raises:
             DataError: on latents of another shape.
         """
-        if y.shape[1:] != self.shape:
-            raise DataError(
-                f"a latent of shape {tuple(y.shape)}",
-                f"(B, {', '.join(map(str, self.shape))})",
-            )
+        check_shape(y, self.shape, "a latent")
         decode: Callable[..., Tensor] = self.network.decode
         used = {
             name: values
