@@ -3,6 +3,7 @@ scans."""
 
 import json
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -94,6 +95,29 @@ def test_returns_of_a_label_map_have_its_labels(columns: int) -> None:
         assert same == 1 or (columns == 1024 and same > 0.9)
         near = np.abs(image.range - wanted.range)[known] < 0.05 * wanted.range[known]
         assert near.mean() > 0.5  # it stands where the map's scan stood, roughly
+
+
+def first_range(generators: list[Generator]) -> Any:
+    return generators[0].range_images(0, [1], steps=1)[0].range
+
+
+@pytest.mark.slow
+def test_two_generators_go_into_a_worker_that_is_not_forked(
+    generator: Generator,
+) -> None:
+    """Of a fork server, which takes 250 descriptors: the default since Python 3.14."""
+    before = len(pickle.dumps(generator))
+    two = [generator, load_generator("town")]
+    loader = DataLoader(
+        two,  # type: ignore[arg-type]
+        num_workers=1,
+        collate_fn=first_range,
+        multiprocessing_context="forkserver",
+    )
+    expected = first_range([load_generator("town")])
+    assert [np.array_equal(made, expected) for made in loader] == [True, True]
+    assert len(pickle.dumps(generator)) == before
+    assert np.array_equal(first_range([generator]), expected)
 
 
 @pytest.mark.slow

@@ -8,6 +8,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import accumulate
+from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -62,6 +64,8 @@ class SamplingOptions(TypedDict, total=False):
     solver: str
     guidance: float
 
+
+_ALIGNED = 512  # bytes
 
 _OPTIONS = dict.fromkeys(("objects", *SamplingOptions.__annotations__))
 
@@ -193,6 +197,25 @@ class Generator:
         size = sum(p.numel() for part in parts for p in part.parameters())
         card = model_card(str(repository), self.header, self.hash, size, licence)
         return push(repository, card.encode(), {self.path.name: self.path}, private)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For a process that starts, the weights are in one block of memory, of which it gets one
+        descriptor: it takes 250. Other pickles would hold the whole block with each of them."""
+        networks = nn.ModuleList(filter(None, [self.network, self.autoencoder]))
+        tensors = [*networks.parameters(), *networks.buffers()]
+        if get_spawning_popen() is None:
+            networks._apply(torch.clone)  # type: ignore[no-untyped-call]
+        elif len({t.untyped_storage().data_ptr() for t in tensors}) > 1:
+            # aligned as torch aligns them, so that products have the same bits
+            sizes = (-(-t.nbytes // _ALIGNED) * _ALIGNED for t in tensors)
+            starts = [*accumulate(sizes, initial=0)]
+            block = torch.empty(starts[-1], dtype=torch.uint8, device=self.device)
+            for tensor, start in zip(tensors, starts, strict=False):
+                part = block[start : start + tensor.nbytes].view(tensor.dtype)
+                tensor.data = part.as_strided(tensor.shape, tensor.stride()).copy_(
+                    tensor
+                )
+        return vars(self)
 
     def as_synthetic(self, seed: int = 0) -> "Generated":
         """The scans of a seed by number, made when they are read."""
