@@ -14,7 +14,6 @@ from torch import Tensor
 
 from lidar_synth.errors import DataError
 from lidar_synth.generate.flow.guidance import autoguide
-from lidar_synth.generate.flow.moments import match_moments
 from lidar_synth.generate.flow.path import (
     METRICS,
     TIMESTEPS,
@@ -27,6 +26,7 @@ from lidar_synth.generate.flow.path import (
     velocity_loss,
 )
 from lidar_synth.generate.flow.solvers import solve, uniform_grid
+from lidar_synth.lab.train.moments import match_moments
 from lidar_synth.noise import gaussian, uniform
 
 

@@ -19,7 +19,7 @@ generation needs::
     time_grid       times descending from 1 to 0: the steps that the weights were trained for
     other_grids     time grids for other numbers of steps, if there are any
     matches         {number of steps: (2, C, rows) scale and shift of its states}, which gives them
-                    the moments of the states of ``time_grid``; see ``flow.moments``
+                    the moments of the states of ``time_grid``
     provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher,
                     recipe, metrics
     weights         sha256 of all tensors
@@ -144,7 +144,8 @@ class Header:
         if str(steps) not in self.matches or grid != self.grid(steps):
             return state
         scale, shift = state.new_tensor(self.matches[str(steps)])[..., None]
-        return state * scale + shift
+        matched: Tensor = state * scale + shift
+        return matched
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as the file stores them, without ``weights`` and ``checksum``."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import (
@@ -20,18 +20,18 @@ from lidar_synth.generate.checkpoint import (
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, blank
 from lidar_synth.generate.flow.distill import STRATEGIES, every_piece
 from lidar_synth.generate.flow.guidance import autoguide, guide
-from lidar_synth.generate.flow.moments import match_moments
 from lidar_synth.generate.flow.path import (
     Example,
     Velocity,
     balanced_velocity_loss,
 )
-from lidar_synth.generate.flow.solvers import mean_velocity, solve, uniform_grid
+from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.encoders.clip_views import ClipViewEncoder
 from lidar_synth.lab.train.config import DistillConfig
 from lidar_synth.lab.train.data import Batch, Batches
+from lidar_synth.lab.train.moments import measure_matches
 from lidar_synth.lab.train.precision import choose_precision, convert_products
 from lidar_synth.lab.train.provenance import provenance_of
 from lidar_synth.lab.train.ranks import ALONE, Ranks
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
 MEASURED = 64
 """Number of samples whose moments are measured."""
-BATCH = 8
-"""Of these at a time."""
 ROUNDING = 2**-7
 SMALL = 1e-6
 """Relative and absolute differences of weights that were stored in float16 or bfloat16."""
@@ -140,35 +138,6 @@ class StudentStage(Stage):
                 network, self.header, noise, data.conditions(range(MEASURED))
             )
             self.header = replace(self.header, matches=found)
-
-
-@torch.no_grad()
-def measure_matches(
-    network: nn.Module, header: Header, noise: Tensor, conditions: Tensor | None
-) -> dict[str, list[Any]]:
-    """The ``matches`` of a header: what gives states in fewer steps the moments of those in the
-    steps of ``time_grid``.
-
-    Args:
-        network: v(y, t, c, end).
-        header: of the student.
-        noise: (B, *state) noise, on the network's device.
-        conditions: (B, ...) conditions; None if unconditional.
-    """
-
-    def states(grid: Sequence[float]) -> Tensor:
-        velocity = mean_velocity(network, grid)
-        made = []
-        for part in torch.arange(len(noise)).split(BATCH):
-            cond = None if conditions is None else conditions[part].to(noise.device)
-            made.append(solve(velocity, noise[part], grid, cond=cond))
-        return torch.cat(made)
-
-    wanted = states(header.time_grid)
-    return {
-        str(len(grid) - 1): match_moments(states(grid), wanted).tolist()
-        for grid in header.other_grids
-    }
 
 
 def _check_teacher(config: DistillConfig, teacher: Checkpoint) -> None:
