@@ -171,18 +171,16 @@ class MixedBatches(Divided, Sampler[list[int]]):
                 f"{len(self.dataset)} samples of an epoch with drop_last=True",
                 f"{self.batch_size * self.world_size} or more: a batch on every rank",
             )
-        steps = self._steps()
         epoch = self.dataset.epoch
-        again = self.dataset.current.passed.get(self.rank) == (epoch, steps.start)
-        if again or epoch != self._start[0]:  # the pass that was resumed is over
+        if epoch != self._start[0]:  # the epoch that was resumed is over
             self._start = self._taken = (0, 0)
-            steps = self._steps()
+        steps = self._steps()
         if steps and len(steps[-1]) < self.world_size:
             warnings.warn(
                 f"{len(steps[-1])} samples left for {self.world_size} ranks: some get none",
                 stacklevel=2,
             )
-        if again:
+        if self.dataset.current.passed.get(self.rank) == (epoch, steps.start):
             self.dataset.current.warn(REPEATED.format(epoch))
         before, yielded = self._fetched
         fetched = self.dataset.current.fetched - before
@@ -230,7 +228,7 @@ class MixedBatches(Divided, Sampler[list[int]]):
         return make_state(mixture, *after_batches(mixture, epoch, steps, done))
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Resume from a state, and set the dataset to its epoch. Later passes start at position 0.
+        """Resume from a state, and set the dataset to its epoch. Later epochs start at position 0.
 
         Raises:
             ConfigError: on an invalid state, or one of another mixture.

@@ -66,6 +66,8 @@ class MixedLoader(DataLoader[Any]):
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next pass; raises as ``MixedScans.set_epoch``."""
+        if self._pass[1] and self.epoch > self._mixed.epoch:
+            self._batches._start = (0, 0)  # the pass that was resumed is over
         self._mixed.set_epoch(epoch)
         self._pass = (epoch, 0)
 
