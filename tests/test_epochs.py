@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from itertools import islice
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -118,15 +119,17 @@ def test_a_hook_at_the_beginning_of_an_epoch(workers: int) -> None:
         assert samples(iterator) == planned(train, 1)
 
 
+def start_slowly(worker: int) -> None:
+    """With a thread of its own, such as a logger's."""
+    Thread(target=time.sleep, args=(60,), daemon=True).start()
+    time.sleep(0.5)
+
+
 def test_a_slow_worker_starts_in_the_epoch_in_which_its_pass_began() -> None:
     """It has fetched nothing yet, but the others may have."""
     train = mixed()
     loader = DataLoader(
-        train,
-        4,
-        num_workers=1,
-        collate_fn=list,
-        worker_init_fn=lambda _: time.sleep(0.5),
+        train, 4, num_workers=1, collate_fn=list, worker_init_fn=start_slowly
     )
     iterator = iter(loader)
     train.set_epoch(1)

@@ -257,9 +257,10 @@ def _is_mixed(dataset: Any) -> bool:
 
 
 def _has_just_started() -> bool:
-    """Whether this is a worker in its first pass for certain: it has sent nothing, as the queue to
-    the main process has no thread yet."""
-    return get_worker_info() is not None and threading.active_count() == 1
+    """Whether this is a worker in its first pass for certain: it has sent nothing, as no thread
+    feeds the queue to the main process yet."""
+    feeds = any(t.name == "QueueFeederThread" for t in threading.enumerate())
+    return get_worker_info() is not None and not feeds
 
 
 def _running_fetcher() -> Any:
