@@ -197,8 +197,8 @@ class CurrentEpoch:
         self.passed.clear()
 
     def take_pass(self, other: "CurrentEpoch") -> None:
-        """Adopt the latest pass of another mixture, so that a repetition is noticed."""
-        self._shared[_PASS] = other._shared[_PASS]
+        """Adopt the latest pass of another mixture, so that a repetition is warned of, once."""
+        self._shared[_PASS:_USED] = other._shared[_PASS:_USED]
         self.passed = dict(other.passed)
 
     def __getstate__(self) -> dict[str, Any]:
