@@ -370,6 +370,12 @@ def test_batch_mixing_takes_a_batch_sampler_and_several_sources(
     assert list(BatchMixer(dataset, batch_sampler=resumed)) == []
     with pytest.raises(ConfigError, match="batch_size 0"):
         BatchMixer(dataset, 0)
+    for options in ({}, {"batch_size": 2, "batch_sampler": resumed}):
+        with pytest.raises(
+            ConfigError,
+            match="batch_size=.* and batch_sampler=.*; expected one of them",
+        ):
+            BatchMixer(dataset, **options)
 
 
 def test_a_loop_that_is_left_early_leaves_no_thread(generator: Generator) -> None:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from lidar_synth.errors import ConfigError
 from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry import Scan
 from lidar_synth.mixing import MixedScans
@@ -43,12 +44,13 @@ class BatchMixer:
         dataset: the dataset. The main process makes the scans of generators; workers load all other
             samples.
         batch_size: number of samples in a batch, in the order of the plan.
-        batch_sampler: replaces ``batch_size``, such as ``dataset.batches(...)`` of one rank.
+        batch_sampler: instead of ``batch_size``, such as ``dataset.batches(...)`` of one rank.
         options: other options of ``DataLoader``, such as ``num_workers``; ``collate_fn`` is
             ``dataset.collate``.
 
     Raises:
-        ConfigError: on a batch size below 1.
+        ConfigError: if both or neither of ``batch_size`` and ``batch_sampler`` are given, or on a
+            batch size below 1.
 
     Example:
         >>> from lidar_synth import BatchMixer, MixedScans, load_generator, open_scans
@@ -62,13 +64,18 @@ class BatchMixer:
     def __init__(
         self,
         dataset: MixedScans,
-        batch_size: int = 1,
+        batch_size: int | None = None,
         *,
         batch_sampler: Sampler[list[int]] | None = None,
         **options: Any,
     ) -> None:
+        if (batch_size is None) == (batch_sampler is None):
+            raise ConfigError(
+                f"batch_size={batch_size} and batch_sampler={batch_sampler}",
+                "one of them",
+            )
         if batch_sampler is None:
-            batch_sampler = dataset.batches(batch_size)
+            batch_sampler = dataset.batches(batch_size or 0)
         self.dataset = dataset
         self.batch_sampler = batch_sampler
         self._loader = DataLoader(
