@@ -175,6 +175,9 @@ def test_a_stream_is_in_no_sampler_and_no_concatenation() -> None:
         AssertionError, match="ConcatDataset does not support IterableDataset"
     ):
         ConcatDataset([stream, mixed("rising")])
+    endless: Any = MixedStream(mixed("rising"), batch_size=4)
+    with pytest.raises(TypeError, match="endless=False"):
+        DistributedSampler(endless, 2, 0)
 
 
 @pytest.fixture

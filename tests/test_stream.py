@@ -132,8 +132,10 @@ def test_the_length_is_that_of_a_ranks_share(
         batches = list(loader)
         assert len(stream) == sum(map(len, batches))
         assert len(loader) == len(batches)
+    endless = MixedStream(mixed(), batch_size=size)
+    assert endless
     with pytest.raises(TypeError, match="endless=False"):
-        len(load(MixedStream(mixed(), batch_size=size), 0))
+        len(load(endless, 0))
 
 
 @pytest.mark.parametrize("endless", [False, True])

@@ -117,6 +117,9 @@ class MixedStream(Divided, IterableDataset[Any]):
             rank_share(range(rest), self.rank, self.world_size)
         )
 
+    def __bool__(self) -> bool:
+        return True  # an endless one has no length
+
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch in which iterating begins."""
         self.scans.set_epoch(epoch)
