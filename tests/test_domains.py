@@ -350,9 +350,11 @@ def test_a_ratio_takes_the_place_of_the_recipe_and_says_so(
 def test_a_schedule_of_weights_that_is_too_short_is_named_before_the_epoch() -> None:
     mixed = MixedScans(REAL, SYNTHETIC, 0.5, loss_weight=[1.0, 0.1])
     mixed.set_epoch(1)
-    with pytest.raises(ConfigError, match="loss_weight=.* in epoch 2; expected"):
+    with pytest.raises(ConfigError, match="^loss_weight in epoch 2; expected"):
         mixed.set_epoch(2)
     assert mixed.epoch == 1
+    with pytest.raises(ConfigError, match=r"^loss_weight=\{0: 1, 3: 9\}; expected"):
+        MixedScans(REAL, SYNTHETIC, 0.5, loss_weight={0: 1, 3: 9})
 
 
 def test_a_wrapped_dataset_gets_the_recipe_too() -> None:

@@ -26,13 +26,15 @@ def make_weight(weight: Any, epoch: int = 0) -> Schedule:
     Raises:
         ConfigError: on anything else, or without a weight for the epoch.
     """
+    given = f"loss_weight={weight!r}"
     try:
         schedule = make_schedule(weight)
+        given = f"loss_weight in epoch {epoch}"
         share_of(schedule, epoch)
         return schedule
     except ConfigError as error:
         raise ConfigError(
-            f"loss_weight={weight!r} in epoch {epoch}",
+            given,
             "the weight of synthetic samples in the loss, from 0 to 1, or one by epoch, such as "
             "{0: 1.0, 10: 0.1}, whose last one stays",
         ) from error
