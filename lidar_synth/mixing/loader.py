@@ -47,7 +47,7 @@ class MixedLoader(DataLoader[Any]):
                 raise ConfigError(
                     f"{name}={options[name]} for a loader of a mixture",
                     "batches in the plan's order, which is shuffled, as state_dict counts them",
-                    DIVIDED,
+                    DIVIDED if "sampler" in name else "",
                 )
         self._mixed = dataset
         self._batches = MixedBatches(dataset, batch_size, drop_last=drop_last)
