@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any, Protocol
+from typing import Any
 
 from torch.utils.data import Sampler
 
@@ -29,17 +29,6 @@ DIVIDED = (
     "With Lightning or Fabric, set use_distributed_sampler=False: a mixture divides its batches "
     "among the ranks itself."
 )
-
-
-class Epochs(Protocol):
-    """The part of a mixture that a batch sampler uses."""
-
-    @property
-    def epoch(self) -> int: ...
-
-    def __len__(self) -> int: ...
-
-    def __getattr__(self, name: str) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -102,7 +91,7 @@ def rank_share(step: range, rank: int, world_size: int) -> range:
     return range(start, start + size + (rank < larger))
 
 
-def resume_epoch(dataset: Epochs, epoch: int, position: int) -> None:
+def resume_epoch(dataset: Any, epoch: int, position: int) -> None:
     """Set the dataset to the epoch of a loaded state.
 
     If the state marks the end of an epoch and the trainer has already set the next one, that one
@@ -138,7 +127,7 @@ class MixedBatches(Divided, Sampler[list[int]]):
 
     def __init__(
         self,
-        dataset: Epochs,
+        dataset: Any,  # a MixedScans, whose module imports this one
         batch_size: int,
         *,
         rank: int | None = None,
