@@ -3,7 +3,7 @@ line that names the option or what was expected and, for names, the nearest ones
 
 import re
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -234,17 +234,25 @@ def test_the_help_of_all_commands_is_whole() -> None:
         assert "..." not in said.split("Commands:")[1]
 
 
-def test_examples_of_commands_keep_their_lines() -> None:
-    group = get_command(app)
-    assert isinstance(group, TyperGroup)
+def all_commands(group: Any, parent: str = "") -> Iterator[tuple[str, Any]]:
+    """Every command with its name, and those of groups by ``group command``."""
     for name, command in group.commands.items():
+        yield f"{parent}{name}", command
+        if isinstance(command, TyperGroup):
+            yield from all_commands(command, f"{parent}{name} ")
+
+
+def test_commands_of_groups_are_visited() -> None:
+    assert {"bake", "bank", "bank merge"} <= dict(all_commands(get_command(app))).keys()
+
+
+def test_examples_of_commands_keep_their_lines() -> None:
+    for name, command in all_commands(get_command(app)):
         assert not re.search(r"(?<!\x08\n)Examples?:", command.help or ""), name
 
 
 def test_arguments_of_commands_are_shown_by_a_name_of_their_own() -> None:
-    group = get_command(app)
-    assert isinstance(group, TyperGroup)
-    for name, command in group.commands.items():
+    for name, command in all_commands(get_command(app)):
         given = [p for p in command.params if p.param_type_name == "argument"]
         assert all(getattr(param, "metavar", None) for param in given), name
 
