@@ -43,7 +43,11 @@ def test_a_dry_run_needs_no_gpu_where_the_bake_needs_none(
     {
         "": "8.0 minutes with 1 worker, 0.01 scans/s",
         "--workers 2": "4.0 minutes with 2 workers, 0.02 scans/s",
+        "--workers 3": "4.0 minutes with 3 workers, 0.02 scans/s",
         "--workers 16": "2.0 minutes with 4 workers, 0.03 scans/s",
+        "--workers 16 --count 10": "96 seconds with 8 workers, 0.10 scans/s",
+        "--workers 2 --num-shards 2 --shard-index 1": "2.0 minutes with 2 workers",
+        "--num-shards 8 --shard-index 5": "0 seconds with 1 worker, 0.00 scans/s",
     }.items(),
 )
 def test_a_dry_run_divides_the_time_by_the_workers(
@@ -55,6 +59,7 @@ def test_a_dry_run_divides_the_time_by_the_workers(
 ) -> None:
     measured = Estimate(1e6, 480.0, "cpu")
     monkeypatch.setattr("lidar_synth.bake.estimate.estimate", lambda plan: measured)
+    monkeypatch.setattr("lidar_synth.files.processes.usable_cores", lambda: 8)
     assert said in run(model, tmp_path, f"--shard-size 1 {options} --dry-run").output
 
 
