@@ -30,6 +30,7 @@ CLEARANCE = 0.2
 """Minimum distance between an object and its surroundings, metres."""
 # height above the lowest return, metres, below which returns count as ground if there are no labels
 _STACK = 0.3
+_MIRRORED = 0.5  # minimum depth, metres, of what a mirror shows under the ground
 _SIDES = 16  # number of directions in which ground must lie to enclose a box
 _NO_LABELS = np.empty(0, np.uint8)
 
@@ -187,11 +188,13 @@ def _around(points, box, reach):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _lowest(local):  # type: ignore[no-untyped-def]
-    """The height that 5 % of the returns lie below, and at least two: stray ones and those that a
-    mirror shows under the ground."""
+    """The third lowest height, since two stray returns may lie below the ground; if a mirror shows
+    more of them, the height that 5 % lie below."""
     if len(local) < LEAST:
         return np.inf
-    return np.sort(local[:, 2])[max(2, len(local) // 20)]
+    heights = np.sort(local[:, 2])
+    level = heights[max(2, len(local) // 20)]
+    return level if level - heights[2] > _MIRRORED else heights[2]
 
 
 @_compiled
