@@ -32,18 +32,19 @@ def point_rays(azimuth: Float64Array, elevation: Float64Array) -> Float64Array:
 @lru_cache(maxsize=8)
 def free_rays(sensor: Sensor) -> NDArray[np.bool_]:
     """(H, F) which rays of a sensor's firings the ego vehicle does not block; read-only."""
-    hdl = bool(
-        sensor.heights
-    )  # only lasers of an HDL-64E start at heights of their own
     azimuth = sensor.firing_azimuths()
     elevation, height = (
         np.broadcast_to(v[:, None], azimuth.shape) for v in sensor.optics()
     )
+    # An HDL-64E is known by its highest laser, which starts 10 cm above its lowest.
+    hdl = height[0, 0] > height[-1, 0] + 0.05
     rays = point_rays(azimuth, elevation)
     side = np.resize([-_LASER_OFFSET, _LASER_OFFSET], len(azimuth))[:, None] * hdl
     start = np.stack([side * np.sin(azimuth), side * np.cos(azimuth), height], -1)
-    body = [assemble(n).triangles for n in ("ego_vehicle", "camera_mounts")[: 1 + hdl]]
-    distance = Solid(np.concatenate(body)).first(
+    body = assemble("ego_vehicle").triangles
+    if hdl:
+        body = np.r_[body, assemble("camera_mounts").triangles]
+    distance = Solid(body).first(
         *(v.reshape(-1, 3).astype(np.float32) for v in (start, rays))
     )[0]
     free = np.isinf(distance).reshape(azimuth.shape)
