@@ -23,6 +23,7 @@ from lidar_synth.generate.models.surface_codec.blocks import (
     split,
     to_patches,
 )
+from lidar_synth.generate.models.surface_codec.bounds import bounds_of
 from lidar_synth.generate.models.surface_codec.measure_noise import PLANTS
 from lidar_synth.generate.models.surface_codec.reflectance import ZeroInflatedLogistic
 from lidar_synth.generate.models.surface_codec.relief import (
@@ -235,6 +236,17 @@ def layout_with_a_box() -> Tensor:
     )
     image[..., 4:9, 30:41] = values.view(5, 1, 1)
     return image
+
+
+def test_bounds_leave_out_what_an_image_rounds() -> None:
+    """Half a step of the depth, and of the chord."""
+    bounds = bounds_of(layout_with_a_box(), 256, PATCH, 20, FORMAT.normalisation)
+    boxed = bounds.near < bounds.far
+    near, far = (FORMAT.normalisation.decode(v[boxed]) for v in bounds[:2])
+    assert boxed.sum() == 55
+    assert np.allclose(near, 12 + DEPTH_STEP / 2, rtol=0, atol=1e-4)
+    leave = 15 - CHORD_STEP / 2 - DEPTH_STEP / 2
+    assert np.allclose(far, leave, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("width", [256, 128])

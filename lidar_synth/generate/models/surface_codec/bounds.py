@@ -53,8 +53,8 @@ def bounds_of(
     """
     code = layout[:, 0]
     # Images round to the nearest step: at worst, a ray enters and leaves half a step further in.
-    depth = depths_of(layout) + DEPTH_STEP
-    chord = (layout[:, 3].float() - 0.5) * CHORD_STEP - 2 * DEPTH_STEP
+    depth = depths_of(layout) + DEPTH_STEP / 2
+    chord = (layout[:, 3].float() - 0.5) * CHORD_STEP - DEPTH_STEP
     boxed = code >= CODES["Car"]
     blank = (code == 0).all(2).all(1)[:, None, None]
     near = torch.where(boxed, normalisation.encode(depth), 1.0).masked_fill(blank, -1.0)
