@@ -97,6 +97,14 @@ def test_returns_of_a_label_map_have_its_labels(columns: int) -> None:
         assert near.mean() > 0.5  # it stands where the map's scan stood, roughly
 
 
+def test_an_ordinary_pickle_leaves_the_weights_where_they_are(
+    generator: Generator,
+) -> None:
+    places = [p.data_ptr() for p in generator.network.parameters()]
+    pickle.dumps(generator)
+    assert [p.data_ptr() for p in generator.network.parameters()] == places
+
+
 def first_range(generators: list[Generator]) -> Any:
     return generators[0].range_images(0, [1], steps=1)[0].range
 

@@ -56,7 +56,8 @@ class SamplingOptions(TypedDict, total=False):
             (1, 0.86, 0.58, 0.22, 0).
         solver: a key of ``SOLVERS``, by default "euler".
         guidance: scale of classifier-free guidance; 1, the default, is no guidance. A larger scale
-            follows the condition more closely; any scale but 1 doubles the computation.
+            follows the condition more closely; any scale but 1 doubles the computation, and leaves
+            the moments of fewer steps unmatched.
     """
 
     steps: int | None
@@ -199,12 +200,15 @@ class Generator:
         return push(repository, card.encode(), {self.path.name: self.path}, private)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For a process that starts, the weights are in one block of memory, of which it gets one
-        descriptor: it takes 250. Other pickles would hold the whole block with each of them."""
+        """A fork server passes at most 250 file descriptors to a new process, one for each tensor,
+        so the weights are put into one block first. Elsewhere they are taken apart again, as each
+        tensor would be pickled with the whole block."""
         networks = nn.ModuleList(filter(None, [self.network, self.autoencoder]))
         tensors = [*networks.parameters(), *networks.buffers()]
         if get_spawning_popen() is None:
-            networks._apply(torch.clone)  # type: ignore[no-untyped-call]
+            for tensor in tensors:
+                if tensor.nbytes < tensor.untyped_storage().nbytes():
+                    tensor.data = tensor.clone()
         elif len({t.untyped_storage().data_ptr() for t in tensors}) > 1:
             # aligned as torch aligns them, so that products have the same bits
             sizes = (-(-t.nbytes // _ALIGNED) * _ALIGNED for t in tensors)
