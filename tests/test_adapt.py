@@ -564,9 +564,10 @@ def test_sensors_that_the_networks_cannot_have_are_refused(
 
 def test_a_model_that_is_moved_to_its_own_sensor_stays_the_same(model: Path) -> None:
     held = load_checkpoint(model)
-    matched = replace(held.header, matches={"1": [[[1.1]], [[0.0]]]})
+    several = replace(held.header, other_grids=((1.0, 0.0),))
+    matched = replace(several, matches={"1": [[[1.1]], [[0.0]]]})
     header, networks = regrid(held._replace(header=matched), TINY)
-    assert header == held.header  # moments are those of the model's own rows
+    assert header == several  # moments are those of the model's own rows
     for name, network in networks.items():
         for key, value in network.state_dict().items():
             torch.testing.assert_close(

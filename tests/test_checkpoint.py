@@ -25,6 +25,8 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.models import build_network
 
+MATCH = [[[1.1] * 8] * 7, [[0.0] * 8] * 7]
+
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
@@ -178,6 +180,10 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
             "missing",
         ),
         ({"networks": [1]}, "header with invalid values"),
+        ({"matches": {"2": MATCH}}, "matches for '2' steps"),
+        ({"other_grids": [[1, 0]], "matches": {"1": MATCH[:1]}}, "another shape"),
+        ({"other_grids": [[1, 0]], "matches": {"1": [[[1]], [["1"]]]}}, "finite"),
+        ({"other_grids": [[1, 0]], "matches": {"1": [[[1]], [[1e39]]]}}, "finite"),
         ({"weights": None}, "do not match their checksum"),
     ],
     ids=str,

@@ -74,7 +74,7 @@ class Header:
     """The header of a checkpoint; the module's docstring describes its fields.
 
     Raises:
-        ConfigError: on invalid networks, channels, time grid, provenance or conditioning.
+        ConfigError: on invalid networks, channels, time grids, matches, provenance or conditioning.
     """
 
     networks: dict[str, NetworkSpec]
@@ -95,6 +95,12 @@ class Header:
             )
         for grid in (self.time_grid, *self.other_grids):
             read_grid(grid)
+        for steps, match in self.matches.items():
+            if steps not in {str(len(grid) - 1) for grid in self.other_grids}:
+                raise ConfigError(
+                    f"matches for {steps!r} steps", "numbers of steps of other_grids"
+                )
+            _check_match(match)
         if missing := [
             k for k in ("data", "data_licence", "licence") if not self.provenance.get(k)
         ]:
@@ -213,6 +219,18 @@ class Header:
             if values.get(key) != expected[key]:
                 raise ConfigError(f"{key} {values.get(key)!r}", repr(expected[key]))
         return header
+
+
+def _check_match(match: Any) -> None:
+    try:
+        values = torch.tensor(match, dtype=torch.float32)
+    except (TypeError, ValueError, RuntimeError):
+        values = torch.empty(0)
+    if values.dim() != 3 or len(values) != 2 or not values.isfinite().all():
+        raise ConfigError(
+            "matches of another shape or with invalid values",
+            "(2, C, rows) finite numbers for each number of steps",
+        )
 
 
 def join(networks: Mapping[str, nn.Module]) -> nn.Module:
