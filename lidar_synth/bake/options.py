@@ -114,6 +114,6 @@ class BakeJob(Drawing):
     )
     layout: Literal["plain", "paged"] = Field(
         "plain",
-        description="layout of the HDF5 files: plain | paged (for HDF5 over a network; stores times, "
-        "so that bytes differ from run to run)",
+        description="layout of the HDF5 files: plain | paged (for HDF5 over a network; stores "
+        "times, so that bytes differ from run to run)",
     )
