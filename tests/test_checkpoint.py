@@ -184,6 +184,7 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
         ({"other_grids": [[1, 0]], "matches": {"1": MATCH[:1]}}, "another shape"),
         ({"other_grids": [[1, 0]], "matches": {"1": [[[1]], [["1"]]]}}, "finite"),
         ({"other_grids": [[1, 0]], "matches": {"1": [[[1]], [[1e39]]]}}, "finite"),
+        ({"other_grids": [[1, 0]], "matches": {"1": [[[1]], [[10**400]]]}}, "finite"),
         ({"weights": None}, "do not match their checksum"),
     ],
     ids=str,

@@ -224,7 +224,7 @@ class Header:
 def _check_match(match: Any) -> None:
     try:
         values = torch.tensor(match, dtype=torch.float32)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         values = torch.empty(0)
     if values.dim() != 3 or len(values) != 2 or not values.isfinite().all():
         raise ConfigError(
