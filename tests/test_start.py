@@ -127,7 +127,7 @@ def test_a_student_that_is_trained_further_keeps_its_own_networks(
     stage = student(tmp_path, TEACHER, f"init={path}")
     assert stage.header.networks == header.networks
     assert stage.network.window == (3, 5)
-    save_checkpoint(path, replace(header, other_grids=()), town.networks)
+    save_checkpoint(path, replace(header, other_grids=(), matches={}), town.networks)
     given = [f"init={path}", "also=[]"]
     student(tmp_path, TEACHER, *given, f"grid={list(header.time_grid)}")
     with pytest.raises(
