@@ -71,7 +71,10 @@ class Reads(Dataset[int]):
 
     def __getitem__(self, index: int) -> int:
         number = int(self.numbers[index])
-        return int(checksum(self.bank.image(number)) != self.known[number])
+        return int(
+            checksum(self.bank._slots.encoding.decode(self.bank.read(number)[1]))
+            != self.known[number]
+        )
 
 
 def loader(
