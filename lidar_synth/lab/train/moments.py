@@ -1,7 +1,7 @@
 """The moments of the states of few steps, matched to those of more.
 
 One step from noise gives little more than the mean of what the noise may become, so its states vary
-less than those of four steps: in the shipped ``town`` by 5 to 12 % a channel.
+less than those of four steps: in the shipped ``town`` by 2 to 10 % a channel.
 """
 
 from collections.abc import Sequence
