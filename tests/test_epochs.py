@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from itertools import islice
+from multiprocessing import Queue
 from threading import Thread
 from typing import Any
 
@@ -30,6 +31,7 @@ from lidar_synth.mixing.state import make_state
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
 REAL = 200
+queues: list[Any] = []
 LATE = (
     r"set_epoch\(1\) while a DataLoader was iterating over epoch 0.*before iter.*"
     r"batch_sampler=train.batches"
@@ -120,8 +122,10 @@ def test_a_hook_at_the_beginning_of_an_epoch(workers: int) -> None:
 
 
 def start_slowly(worker: int) -> None:
-    """With a thread of its own, such as a logger's."""
+    """With threads of its own, such as a logger's and those of queues."""
     Thread(target=time.sleep, args=(60,), daemon=True).start()
+    queues.append(Queue())
+    queues[0].put(worker)
     time.sleep(0.5)
 
 

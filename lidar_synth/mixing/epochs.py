@@ -7,7 +7,6 @@ therefore raises an error.
 """
 
 import sys
-import threading
 import warnings
 from types import FrameType
 from typing import Any
@@ -157,12 +156,13 @@ class CurrentEpoch:
             self._count(0)
             return index.epoch
         epoch = int(self)
-        fetcher = _running_fetcher()
-        if fetcher is None:  # not within a DataLoader's pass
+        fetch = _running_fetch()
+        if fetch is None:  # not within a DataLoader's pass
             return epoch
+        fetcher = fetch.f_locals["self"]
         if fetcher not in self._passes:
             check_whole(fetcher.dataset)
-            self._passes[fetcher] = self.at_start if _has_just_started() else epoch
+            self._passes[fetcher] = epoch if _has_sent(fetch) else self.at_start
             self.note_pass(self._passes[fetcher])
         check_pass(self._passes[fetcher], epoch)
         self._count(1)
@@ -256,19 +256,17 @@ def _is_mixed(dataset: Any) -> bool:
     return hasattr(dataset, "tell_sources")
 
 
-def _has_just_started() -> bool:
-    """Whether this is a worker in its first pass for certain: it has sent nothing, as no thread
-    feeds the queue to the main process yet."""
-    feeds = any(t.name == "QueueFeederThread" for t in threading.enumerate())
-    return get_worker_info() is not None and not feeds
-
-
-def _running_fetcher() -> Any:
-    """The fetcher of the DataLoader on the call stack, or None: torch makes one for each pass in
-    each process."""
+def _running_fetch() -> FrameType | None:
+    """The call of ``fetch`` of a DataLoader's fetcher on the call stack, or None: torch makes a
+    fetcher for each pass in each process."""
     frame: FrameType | None = sys._getframe(1)
-    while frame is not None:
-        if frame.f_code is _MapDatasetFetcher.fetch.__code__:
-            return frame.f_locals["self"]
+    while frame and frame.f_code is not _MapDatasetFetcher.fetch.__code__:
         frame = frame.f_back
-    return None
+    return frame
+
+
+def _has_sent(fetch: FrameType) -> bool:
+    """Whether the caller of ``fetch`` is no worker, or one that has sent something to the main
+    process, perhaps in an earlier pass: its queue has a thread by then."""
+    caller: Any = fetch.f_back
+    return getattr(caller.f_locals.get("data_queue"), "_thread", True) is not None
