@@ -119,7 +119,12 @@ def test_an_arm_that_is_better_everywhere_has_an_interval_above_0() -> None:
 def test_an_arm_that_is_better_at_two_places_has_a_wide_interval() -> None:
     row = compared(True, False, False, False, False, False, False, True)
     low, high = row["interval"]
-    assert low == 0 < row["difference"] < high < 100
+    assert low == 0 < row["difference"] < high
+
+
+def test_an_arm_that_is_better_in_one_seed_only_has_an_interval_with_0() -> None:
+    row = compared(*[True] * 4, *[False] * 4)
+    assert row["difference"] == 50 and row["interval"] == (0, 100)
 
 
 @pytest.mark.parametrize(("places", "seeds"), [(1, 1), (2, 6), (3, 4), (5, 4), (6, 2)])

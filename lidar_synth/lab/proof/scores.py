@@ -142,8 +142,7 @@ def interval(
     seeds.
 
     Places are drawn with replacement, then as many seeds of each as it has. The quantiles are those
-    at which the interval of a mean has the right width for few places (the expanded percentile
-    interval of Hesterberg, "What Teachers Should Know About the Bootstrap", 2015, section 5.4).
+    at which the interval of a mean has the right width for few places (``expanded_quantiles``).
 
     Args:
         differences: (P, S) of every place and seed; NaN where there is none.
@@ -176,6 +175,12 @@ def interval(
         if not shared:
             order = rng.permutation(draws)
         totals += means[order, drawn[:, column]]
-    tail = ndtr(-sqrt(count / (count - 1)) * stdtrit(count - 1, 0.975))
-    low, high = np.quantile(totals / count, (tail, 1 - tail))
+    low, high = np.quantile(totals / count, expanded_quantiles(count))
     return float(low), float(high)
+
+
+def expanded_quantiles(count: int) -> tuple[float, float]:
+    """The quantiles of a bootstrap over ``count`` places between which its 95 % interval lies
+    (Hesterberg, "What Teachers Should Know About the Bootstrap", 2015, section 5.4)."""
+    tail = float(ndtr(-sqrt(count / (count - 1)) * stdtrit(count - 1, 0.975)))
+    return tail, 1 - tail

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidar_synth.lab.proof.detection.arms import ARMS, BASE
 from lidar_synth.lab.proof.detection.bev import Found
@@ -17,7 +16,7 @@ from lidar_synth.lab.proof.detection.scores import (
     judge,
     precision_of,
 )
-from lidar_synth.lab.proof.scores import FEWEST_PLACES
+from lidar_synth.lab.proof.scores import FEWEST_PLACES, expanded_quantiles
 
 CRITERIA = {
     "overlap 0.5": Criterion(0.5),
@@ -100,7 +99,7 @@ def _of_class(
         table[arm] = {
             "by_seed": [_mean([one]) for one in own],
             "difference": round(float(np.nanmean(changes)), 1) if other else None,
-            "interval": interval_of(own, base) if enough else None,
+            "interval": interval_of(own, base, tested) if enough else None,
             "by_place": by_place,
             **{name: _mean(one) for name, one in groups.items()},
         }
@@ -143,27 +142,25 @@ def _mean(groups: Groups) -> float | None:
     return round(float(np.mean(values)), 1) if values else None
 
 
-def interval_of(own: Groups, base: Groups) -> tuple[float, float]:
-    """95 % interval of the mean difference of two arms, percentage points, by a bootstrap over the
-    tested places of each seed.
+def interval_of(own: Groups, base: Groups, tested: Tested) -> tuple[float, float]:
+    """95 % interval of the mean difference of two arms, percentage points, by a bootstrap over
+    seeds and, for all of them together, over tested places.
 
     The average precision is of all drawn places together.
     """
     rng = np.random.default_rng(0)
-    values = [_draw(own, base, rng) for _ in range(DRAWS)]
-    low, high = np.nanquantile(values, (0.025, 0.975))
+    places = list(map(list, tested.values()))
+    names = sorted({name for of_seed in places for name in of_seed})
+
+    def draw() -> float:
+        drawn = rng.choice(names, len(names))
+        changes = []
+        for seed in rng.integers(0, len(places), len(places)):
+            kept = [places[seed].index(name) for name in drawn if name in places[seed]]
+            made, before = ([arm[seed][i] for i in kept] for arm in (own, base))
+            changes.append(_percent(made) - _percent(before))
+        return float(np.mean(changes))
+
+    values = [draw() for _ in range(DRAWS)]
+    low, high = np.nanquantile(values, expanded_quantiles(len(names)))
     return round(float(low), 1), round(float(high), 1)
-
-
-def _draw(
-    own: Groups,
-    base: Groups,
-    rng: np.random.Generator,
-) -> float:
-    differences = []
-    for a, b in zip(own, base, strict=True):
-        picks: NDArray[np.int64] = rng.integers(0, len(a), len(a))
-        differences.append(
-            _percent([a[i] for i in picks]) - _percent([b[i] for i in picks])
-        )
-    return float(np.nanmean(differences))
