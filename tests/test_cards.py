@@ -61,7 +61,7 @@ FRECHET = "Fréchet distance, segmenter"
 SHARED = {
     "Fréchet distance of features": ("", "4 steps", FRECHET),
     "in 1 step": ("", "1 step", FRECHET),
-    "that of `town`": ("town", "4 steps", FRECHET),
+    "that of `town`, other streets": ("town", "4 steps", FRECHET),
     "bird's-eye JSD": ("", "4 steps", "bird's-eye JSD"),
     "mIoU, town segmenter, %": ("", "4 steps", "mIoU with the segmenter, %"),
 }
