@@ -23,8 +23,9 @@ from lidar_synth.lab.town.materials import SurfaceTable, column
 from lidar_synth.lab.town.relief import sample_relief
 
 CALIBRATED_ON = (
-    "its constants were set by statistics of 28 labelled SemanticKITTI frames and of two "
-    "pedestrians of KITTI, the shapes of persons by a network that learnt SemanticKITTI's labels"
+    "its constants were set by statistics of 28 labelled SemanticKITTI frames, the shapes of "
+    "persons by pedestrians of KITTI (2) and PandaSet (26 views) and by a network that learnt "
+    "SemanticKITTI's labels"
 )
 """Labels of real scans that the town owes something to, for label budgets."""
 LEVELS = 256
