@@ -21,8 +21,11 @@ from lidar_synth.integrations.mixture import (
     synthetic_epoch,
 )
 from lidar_synth.integrations.mmdet3d_lists import CLASSES
-from lidar_synth.integrations.nuscenes import CLASSES as NUSCENES_CLASSES
-from lidar_synth.integrations.nuscenes import as_nuscenes, five_values
+from lidar_synth.integrations.nuscenes import (
+    CLASSES as NUSCENES_CLASSES,
+    as_nuscenes,
+    five_values,
+)
 from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 

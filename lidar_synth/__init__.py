@@ -89,61 +89,89 @@ if TYPE_CHECKING:
     from lidar_synth.bank import Bank as Bank
     from lidar_synth.bank.sample import sample_scans as sample_scans
     from lidar_synth.errors import LidarSynthError as LidarSynthError
-    from lidar_synth.formats import KITTI360 as KITTI360
-    from lidar_synth.formats import KITTIObject as KITTIObject
-    from lidar_synth.formats import KITTIRaw as KITTIRaw
-    from lidar_synth.formats import NuScenes as NuScenes
-    from lidar_synth.formats import PandaSet as PandaSet
-    from lidar_synth.formats import SemanticKITTI as SemanticKITTI
-    from lidar_synth.formats import open_scans as open_scans
+    from lidar_synth.formats import (
+        KITTI360 as KITTI360,
+        KITTIObject as KITTIObject,
+        KITTIRaw as KITTIRaw,
+        NuScenes as NuScenes,
+        PandaSet as PandaSet,
+        SemanticKITTI as SemanticKITTI,
+        open_scans as open_scans,
+    )
     from lidar_synth.generate.generator import Generator as Generator
     from lidar_synth.generate.loading import load_generator as load_generator
     from lidar_synth.geometry.assign import assign_beams as assign_beams
-    from lidar_synth.geometry.deskew import Trajectory as Trajectory
-    from lidar_synth.geometry.deskew import deskew as deskew
-    from lidar_synth.geometry.deskew import reskew as reskew
-    from lidar_synth.geometry.layout import Layout as Layout
-    from lidar_synth.geometry.layout import layout_of as layout_of
+    from lidar_synth.geometry.deskew import (
+        Trajectory as Trajectory,
+        deskew as deskew,
+        reskew as reskew,
+    )
+    from lidar_synth.geometry.layout import (
+        Layout as Layout,
+        layout_of as layout_of,
+    )
     from lidar_synth.geometry.layout.files import load_layout as load_layout
-    from lidar_synth.geometry.projection import project as project
-    from lidar_synth.geometry.projection import unfold as unfold
-    from lidar_synth.geometry.projection import unproject as unproject
-    from lidar_synth.geometry.scan import Boxes as Boxes
-    from lidar_synth.geometry.scan import RangeImage as RangeImage
-    from lidar_synth.geometry.scan import Scan as Scan
-    from lidar_synth.geometry.scan import Source as Source
-    from lidar_synth.geometry.sensor import Sensor as Sensor
-    from lidar_synth.geometry.sensor import load_sensor as load_sensor
+    from lidar_synth.geometry.projection import (
+        project as project,
+        unfold as unfold,
+        unproject as unproject,
+    )
+    from lidar_synth.geometry.scan import (
+        Boxes as Boxes,
+        RangeImage as RangeImage,
+        Scan as Scan,
+        Source as Source,
+    )
+    from lidar_synth.geometry.sensor import (
+        Sensor as Sensor,
+        load_sensor as load_sensor,
+    )
     from lidar_synth.lab.evaluate import evaluate as evaluate
-    from lidar_synth.lab.fitting import SensorFit as SensorFit
-    from lidar_synth.lab.fitting import fit_sensor as fit_sensor
-    from lidar_synth.lab.proof import ProofSettings as ProofSettings
-    from lidar_synth.lab.proof import prove as prove
+    from lidar_synth.lab.fitting import (
+        SensorFit as SensorFit,
+        fit_sensor as fit_sensor,
+    )
+    from lidar_synth.lab.proof import (
+        ProofSettings as ProofSettings,
+        prove as prove,
+    )
     from lidar_synth.lab.start import start as start
-    from lidar_synth.lab.town import Skin as Skin
-    from lidar_synth.lab.town import Town as Town
-    from lidar_synth.lab.town import fit_skin as fit_skin
-    from lidar_synth.lab.town import load_skin as load_skin
+    from lidar_synth.lab.town import (
+        Skin as Skin,
+        Town as Town,
+        fit_skin as fit_skin,
+        load_skin as load_skin,
+    )
     from lidar_synth.lab.train.adaptation import adapt as adapt
-    from lidar_synth.labels import ObjectBank as ObjectBank
-    from lidar_synth.labels import make_policy as make_policy
+    from lidar_synth.labels import (
+        ObjectBank as ObjectBank,
+        make_policy as make_policy,
+    )
     from lidar_synth.labels.compose import Compose as Compose
-    from lidar_synth.labels.mix import LaserMix as LaserMix
-    from lidar_synth.labels.mix import PasteObjects as PasteObjects
-    from lidar_synth.labels.mix import PolarMix as PolarMix
-    from lidar_synth.labels.mix import PolarMixOrLaserMix as PolarMixOrLaserMix
-    from lidar_synth.labels.own import IgnoreLabels as IgnoreLabels
-    from lidar_synth.labels.own import KeepBoxes as KeepBoxes
-    from lidar_synth.labels.own import KeepCondition as KeepCondition
-    from lidar_synth.labels.own import KeepLabels as KeepLabels
-    from lidar_synth.labels.own import RemoveLabels as RemoveLabels
+    from lidar_synth.labels.mix import (
+        LaserMix as LaserMix,
+        PasteObjects as PasteObjects,
+        PolarMix as PolarMix,
+        PolarMixOrLaserMix as PolarMixOrLaserMix,
+    )
+    from lidar_synth.labels.own import (
+        IgnoreLabels as IgnoreLabels,
+        KeepBoxes as KeepBoxes,
+        KeepCondition as KeepCondition,
+        KeepLabels as KeepLabels,
+        RemoveLabels as RemoveLabels,
+    )
     from lidar_synth.labels.pseudo import PredictLabels as PredictLabels
-    from lidar_synth.mixing import Linear as Linear
-    from lidar_synth.mixing import MixedScans as MixedScans
-    from lidar_synth.mixing import MixedStream as MixedStream
-    from lidar_synth.mixing import Sources as Sources
-    from lidar_synth.mixing.service import BatchMixer as BatchMixer
-    from lidar_synth.mixing.service import RollingBank as RollingBank
+    from lidar_synth.mixing import (
+        Linear as Linear,
+        MixedScans as MixedScans,
+        MixedStream as MixedStream,
+        Sources as Sources,
+    )
+    from lidar_synth.mixing.service import (
+        BatchMixer as BatchMixer,
+        RollingBank as RollingBank,
+    )
     from lidar_synth.mixing.settings import mix as mix
 
 

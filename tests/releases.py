@@ -14,8 +14,11 @@ from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.lidm.diffusion import schedule_times
 from lidar_synth.lab.importers.lidm import _parts
 from lidar_synth.lab.importers.lidm_names import UNET, UNET_EMA, peer_names
-from lidar_synth.lab.importers.r2flow import HARMONICS, block_names
-from lidar_synth.lab.importers.r2flow import peer_names as r2flow_names
+from lidar_synth.lab.importers.r2flow import (
+    HARMONICS,
+    block_names,
+    peer_names as r2flow_names,
+)
 
 DEPTHS = (1, 1, 1, 1)
 CFG: dict[str, Any] = {

@@ -23,8 +23,7 @@ from test_bake_url import upload
 from torch.utils.data import DataLoader
 
 from lidar_synth import MixedScans, MixedStream, mix
-from lidar_synth.bank import Bank
-from lidar_synth.bank import folder as folder_module
+from lidar_synth.bank import Bank, folder as folder_module
 from lidar_synth.bank.cache import ShardCache, read_size
 from lidar_synth.bank.storage import RemoteFile
 from lidar_synth.errors import ConfigError, DataError, FileError

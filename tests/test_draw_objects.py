@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bakes import plan_in
-from small_models import SENSOR as SMALL
-from small_models import write
+from small_models import SENSOR as SMALL, write
 from typer.testing import CliRunner
 
 from lidar_synth import (

@@ -290,6 +290,10 @@ def test_motion_compensation_is_undone_by_poses() -> None:
 WRONG_PATHS: dict[str, tuple[Callable[[], object], str]] = {
     "one pose": (lambda: Trajectory([0.0], np.eye(4)[None]), "K >= 2"),
     "no rotation": (lambda: Trajectory([0.0, 1.0], np.ones((2, 4, 4))), "rotation"),
+    "columns first": (
+        lambda: Trajectory([0.0, 1.0], driving(1.0).poses[:2].swapaxes(1, 2)),
+        "rotation, a translation",
+    ),
     "a mirror": (
         lambda: Trajectory([0.0, 1.0], [np.diag([1, -1, 1, 1]), np.eye(4)]),
         "rotation",

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 from layouts import (
     MAKERS,
@@ -20,8 +19,11 @@ from layouts import (
 from roundtrips import back, same
 from streets import CAMERA, kitti, street
 
-from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
-from lidar_synth.datasets.classes import KITTI360 as KITTI360_CLASSES
+from lidar_synth.datasets.classes import (
+    IGNORE,
+    KITTI360 as KITTI360_CLASSES,
+    SEMANTIC_KITTI,
+)
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import read_named_matrices, write_named_matrices
 from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, KITTIRaw, open_scans

@@ -13,8 +13,7 @@ from torch import Tensor
 from lidar_synth.generate.checkpoint import NetworkSpec
 from lidar_synth.generate.models.hdit.hdit import HDiT
 from lidar_synth.generate.models.positions import BASES, AnglePosition
-from lidar_synth.lab.importers.r2flow import POSITIONS as PEER_POSITIONS
-from lidar_synth.lab.importers.r2flow import convert
+from lidar_synth.lab.importers.r2flow import POSITIONS as PEER_POSITIONS, convert
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

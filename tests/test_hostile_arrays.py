@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from fuzzing.worker import causes
 from hostile import HOSTILE_NPY, POINTS, described, npy, saved
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from layouts import some_scan, write_all
 from limits import in_limits, needs_limits
 

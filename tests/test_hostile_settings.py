@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 from hostile import LINEAR
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from limits import in_limits, needs_limits
 
 from lidar_synth.errors import ConfigError, DataError

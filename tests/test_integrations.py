@@ -35,8 +35,7 @@ from lidar_synth.integrations.mmdet3d_lists import (
     semantic_kitti_list,
 )
 from lidar_synth.integrations.mmdet3d_slots import open_folder, read_url
-from mixtures import SENSOR as SMALL
-from mixtures import Endless, Scans, as_is
+from mixtures import SENSOR as SMALL, Endless, Scans, as_is
 from streets import CAMERA, kitti, semantic_kitti, street, synthetic
 from torch.utils.data import DataLoader, Dataset
 

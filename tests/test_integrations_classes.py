@@ -14,7 +14,7 @@ from lidar_synth.datasets.classes import (
     TRAIN_ID,
     Taxonomy,
 )
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError
 
 TRAIN = np.arange(len(NAMES), dtype=np.uint8)
 POSS = dict.fromkeys((0, 1, 18, 19, 20), 0) | {
@@ -50,6 +50,11 @@ def test_what_is_written_is_read_as_a_class_of_the_same_kind(name: str) -> None:
     for own in ("car", "person", "bicyclist", "road", "building", "vegetation"):
         if (name, own) != ("nuscenes", "bicyclist"):  # there a bicycle holds its rider
             assert back[TRAIN_ID[own]] == TRAIN_ID[own]
+
+
+def test_negative_train_ids_are_not_written() -> None:
+    with pytest.raises(DataError, match=r"train ids \[-250, -1\]"):
+        SEMANTIC_KITTI.encode(np.array([-1, 3, -250]))
 
 
 def test_the_trainers_own_map_gives_the_ids() -> None:

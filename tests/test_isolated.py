@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from lidar_synth import Town, load_generator
 from lidar_synth.datasets.classes import TRAIN_ID

@@ -5,8 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from conftest import Golden, random_scan
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from safetensors.numpy import load_file
 from scipy.linalg import sqrtm
 from scipy.ndimage import distance_transform_edt

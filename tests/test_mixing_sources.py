@@ -10,8 +10,7 @@ import pytest
 import torch
 from mixed import Theirs, loader, mixed
 from mixtures import Endless, Scans, as_is
-from test_generator import SENSOR as GENERATED_SENSOR
-from test_generator import write
+from test_generator import SENSOR as GENERATED_SENSOR, write
 from torch.utils.data import ConcatDataset, DataLoader, IterableDataset, Subset
 
 from lidar_synth import PolarMix, mix
@@ -103,6 +102,8 @@ def test_sources_that_differ_have_different_plans() -> None:
         for indices in ([0, 1], [0, 2])
     ]
     assert len({identity_of(part) for part in parts}) == 4
+    scans = [towns[0][i] for i in range(4)]
+    assert identity_of(scans[:2]) != identity_of(scans[2:])
     assert len({identity_of(SeenAs(part, transfers[0])) for part in parts}) == 4
     assert identity_of(Subset(parts[0], [1])) != identity_of(Subset(parts[1], [1]))
     joined = [ConcatDataset([part, parts[0]]) for part in parts]

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from banks import some_image, write_bank
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from layouts import WRITTEN_AS, some_scan, write_tars
 
 from lidar_synth.errors import DataError, FileError

@@ -11,6 +11,7 @@ from conftest import random_scan, ring_numbers
 from hypothesis import given, settings
 from hypothesis.extra import numpy as hnp
 
+from lidar_synth.bank.sample import sample_scans
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import (
@@ -138,6 +139,13 @@ def test_projection_equals_a_brute_force_search_for_the_nearest_points(
         scan.reflectance[cells.point[cells.point >= 0]],
     )
     assert np.all(image.label[~image.mask] == IGNORE)
+
+
+def test_images_keep_the_boxes_of_their_scan() -> None:
+    scan = sample_scans()[0]
+    scan = replace(scan, ring=np.zeros(len(scan), np.int16))
+    for image in (project(scan), unfold(scan)):
+        assert unproject(image).boxes == scan.boxes is not None
 
 
 def test_points_outside_the_range_limits_hide_no_other_point() -> None:

@@ -19,8 +19,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.lab.evaluate import evaluate
 from lidar_synth.lab.evaluate.published import read_published
-from lidar_synth.lab.reproduce import report
-from lidar_synth.lab.reproduce import work as work_module
+from lidar_synth.lab.reproduce import report, work as work_module
 from lidar_synth.lab.reproduce.report import reproduce
 from lidar_synth.lab.reproduce.tables import read_tables
 from lidar_synth.lab.reproduce.work import VARIABLES, TaskRun, find_data, write_town

@@ -94,7 +94,16 @@ def test_rows_lie_between_their_edges(sensor: Sensor) -> None:
     for s in (sensor, sensor.by_beams()):
         centres = s.row_elevations()
         assert np.all(s.edges[:-1] > centres) and np.all(centres > s.edges[1:])
-        assert np.array_equal(s.row_elevations("corner"), s.edges[:-1])
+        corners = s.row_elevations("corner")
+        assert np.array_equal(corners, s.edges[:-1])
+        corners += 1  # of the caller's own array
+        assert not np.array_equal(corners, s.edges[:-1])
+
+
+@pytest.mark.parametrize("of", ["row_elevations", "column_azimuths", "ray_angles"])
+def test_a_word_for_no_point_of_a_cell_is_refused(of: str) -> None:
+    with pytest.raises(ConfigError, match=r"rays 'corners'.*Did you mean 'corner'"):
+        getattr(presets()["town"], of)("corners")
 
 
 def test_laser_elevations_are_the_beams_or_the_rows() -> None:

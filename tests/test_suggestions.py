@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 import lidar_synth
 from lidar_synth.bake.run import ENGINES
-from lidar_synth.cli import COMMANDS as COMMAND_NAMES
-from lidar_synth.cli import app
+from lidar_synth.cli import COMMANDS as COMMAND_NAMES, app
 from lidar_synth.errors import suggest
 from lidar_synth.formats import READERS, WRITERS
 from lidar_synth.formats.description import Description

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 from flows import gaussian_velocity, select_timesteps
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError, DataError

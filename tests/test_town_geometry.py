@@ -5,8 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from lidar_synth.geometry.overlap import overlapping_pairs
 from lidar_synth.geometry.scan import Boxes
@@ -38,8 +37,14 @@ from lidar_synth.lab.town.plants import (
 )
 from lidar_synth.lab.town.returns import ReturnNoise, cell_noise, laser_gains
 from lidar_synth.lab.town.solid import Solid
-from lidar_synth.lab.town.street import KINDS as STREETS
-from lidar_synth.lab.town.street import LEFT, REACH, RIGHT, SHARES, sample_street
+from lidar_synth.lab.town.street import (
+    KINDS as STREETS,
+    LEFT,
+    REACH,
+    RIGHT,
+    SHARES,
+    sample_street,
+)
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.town.vehicles import vehicles
 from lidar_synth.lab.town.world import STRETCH_FRAMES, WORLD, build_world, rng_for

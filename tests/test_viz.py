@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import random_scan
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from pictures import CAR, ROAD, SMALL, page_data
 from PIL import Image
 

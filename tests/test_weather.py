@@ -425,7 +425,7 @@ def test_scans_that_lack_something(name: str, clear: Scan) -> None:
     points = np.where(clear.points > 40, np.float32(np.nan), clear.points)
     with pytest.raises(DataError, match="NaN or infinite.*isfinite"):
         corruption(replace(clear, points=points), keyed_rng(0))
-    for factor in (np.float32(np.nan), 255):
+    for factor in (np.float32(np.nan), 255, -1):
         bright = replace(clear, reflectance=clear.reflectance * factor)
         with pytest.raises(DataError, match=r"reflectance of .*expected 0 to 1.*255"):
             corruption(bright, keyed_rng(0))

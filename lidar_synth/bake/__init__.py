@@ -26,12 +26,16 @@ _HOME = {
 __all__ = [*_HOME]
 
 if TYPE_CHECKING:
-    from lidar_synth.bake.job import BakePlan as BakePlan
-    from lidar_synth.bake.job import make_plan as make_plan
+    from lidar_synth.bake.job import (
+        BakePlan as BakePlan,
+        make_plan as make_plan,
+    )
     from lidar_synth.bake.options import BakeJob as BakeJob
     from lidar_synth.bake.resources import Resources as Resources
-    from lidar_synth.bake.run import ENGINES as ENGINES
-    from lidar_synth.bake.run import bake as bake
+    from lidar_synth.bake.run import (
+        ENGINES as ENGINES,
+        bake as bake,
+    )
     from lidar_synth.bake.shard import bake_shard as bake_shard
     from lidar_synth.bake.share import Share as Share
 

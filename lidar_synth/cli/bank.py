@@ -50,8 +50,7 @@ def verify(
     import secrets
     from shlex import quote
 
-    from lidar_synth.bake.verify import AGREE, UNLISTED, regenerate
-    from lidar_synth.bake.verify import verify as run
+    from lidar_synth.bake.verify import AGREE, UNLISTED, regenerate, verify as run
     from lidar_synth.errors import ConfigError
 
     options = {"sample": sample, "seed": seed, "model": model, "condition": condition}

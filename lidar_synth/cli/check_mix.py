@@ -59,8 +59,10 @@ def check_mix(
         rows_in_use,
         table_of,
     )
-    from lidar_synth.mixing.settings import mix_for_trainer as make_mixture
-    from lidar_synth.mixing.settings import read_settings
+    from lidar_synth.mixing.settings import (
+        mix_for_trainer as make_mixture,
+        read_settings,
+    )
     from lidar_synth.viz import view_suffix, write_view
 
     if out is not None:

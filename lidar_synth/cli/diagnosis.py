@@ -9,8 +9,11 @@ import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, requires
-from importlib.metadata import version as installed_version
+from importlib.metadata import (
+    PackageNotFoundError,
+    requires,
+    version as installed_version,
+)
 from pathlib import Path
 from typing import Literal
 

@@ -192,7 +192,7 @@ class Taxonomy:
             )
         table = np.zeros(256, np.uint32)
         table[: len(NAMES)] = self.from_train
-        bad = (train >= len(NAMES)) & (train != IGNORE)
+        bad = (train < 0) | (train >= len(NAMES)) & (train != IGNORE)
         if bad.any():
             raise DataError(
                 f"train ids {np.unique(train[bad])[:8].tolist()}",

@@ -34,8 +34,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import KITTI360 as CLASSES
-from lidar_synth.datasets.classes import MAX_INSTANCES, MOVING
+from lidar_synth.datasets.classes import KITTI360 as CLASSES, MAX_INSTANCES, MOVING
 from lidar_synth.datasets.recordings import KITTI360_SPLITS
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import list_files, read_file, read_values

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError, choose
 from lidar_synth.files.disk import files_below
 from lidar_synth.files.parsing import read_arrays
-from lidar_synth.formats.folder import SUFFIXES as OF_POINTS
-from lidar_synth.formats.folder import scan_paths
+from lidar_synth.formats.folder import SUFFIXES as OF_POINTS, scan_paths
 from lidar_synth.formats.npz import (
     check_numbers,
     decode_range_image,

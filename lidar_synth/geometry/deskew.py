@@ -56,10 +56,11 @@ class Trajectory:
         if not (
             np.isfinite(self.poses).all()
             and np.allclose(squares, np.eye(3), atol=1e-4)
+            and np.allclose(self.poses[:, 3], (0, 0, 0, 1))
             and (np.linalg.det(rotations) > 0).all()
         ):
             raise DataError(
-                "poses whose upper left 3 x 3 part is not a rotation",
+                "poses that are not a rotation, a translation and the row 0, 0, 0, 1",
                 "rigid poses, sensor to world",
             )
 

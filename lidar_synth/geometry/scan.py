@@ -457,6 +457,8 @@ def identity_of(source: Any) -> str:
     if identity := getattr(source, "identity", ""):
         return str(identity)
     names = getattr(source, "ids", ())
+    if isinstance(source, list | tuple):
+        names = names or (getattr(scan, "id", "") for scan in source)
     if isinstance(parts := getattr(source, "datasets", None), Iterable):
         names = map(identity_of, parts)
     dataset = getattr(source, "dataset", None)
@@ -483,14 +485,14 @@ def require_finite(scan: Scan) -> None:
 
 
 def require_reflectance(scan: Scan) -> None:
-    """Check that the reflectance of a scan is not an intensity on another scale; values up to 1.1
-    pass.
+    """Check that the reflectance of a scan is not an intensity on another scale; values outside by
+    less than 0.1 pass.
 
     Raises:
         DataError: if some are NaN, or not in [0, 1].
     """
     values = scan.reflectance
-    if not np.abs(values).max(initial=0) < 1.1:
+    if not np.abs(values - np.float32(0.5)).max(initial=0) < 0.6:
         raise DataError(
             f"scan {scan.id!r} with a reflectance of {values.min():g} to {values.max():g}",
             "0 to 1",

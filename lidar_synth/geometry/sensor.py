@@ -18,13 +18,14 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, shorten, suggest
+from lidar_synth.errors import ConfigError, choose, shorten, suggest
 from lidar_synth.files.parsing import parse_yaml, read_yaml
 from lidar_synth.geometry.ouster import read_metadata
 
 Rays = Literal["centre", "corner"]
 """The point of a cell through which its ray passes: the centre (so that unprojected points project
 back to the same cell) or the upper left corner, as in the public code of R2Flow and LiDM."""
+_OFFSETS = {"centre": 0.5, "corner": 0.0}
 
 MOST_CELLS = 1 << 22
 """Rows times columns of a sensor; the largest that are sold have 2^19."""
@@ -258,18 +259,20 @@ class Sensor:
         return self.row_elevations()
 
     def row_elevations(self, rays: Rays = "centre") -> NDArray[np.float32]:
-        """(H,) elevation of each row, radians."""
-        if rays == "corner":
-            return self.edges[:-1]
+        """(H,) elevation of each row, radians; raises a ConfigError on another word than "centre" or
+        "corner"."""
+        if not choose("rays", rays, _OFFSETS):
+            return self.edges[:-1].copy()
         if self.elevations is not None:
             return np.radians(self.elevations).astype(np.float32)
         fraction = (np.arange(self.shape[0]) + 0.5) / self.shape[0]
         return np.radians(self.up - fraction * (self.up - self.down)).astype(np.float32)
 
     def column_azimuths(self, rays: Rays = "centre") -> NDArray[np.float32]:
-        """(W,) azimuth of each column in [-pi, pi), radians, increasing clockwise."""
-        offset = 0.5 if rays == "centre" else 0.0
-        fraction = (np.arange(self.columns) + offset) / self.columns
+        """(W,) azimuth of each column in [-pi, pi), radians, increasing clockwise; raises as
+        ``row_elevations``."""
+        fraction = np.arange(self.columns) + choose("rays", rays, _OFFSETS)
+        fraction /= self.columns
         return ((2 * fraction - 1) * np.pi).astype(np.float32)
 
     def optics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

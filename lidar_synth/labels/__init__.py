@@ -26,16 +26,22 @@ __all__ = list(_HOME)
 if TYPE_CHECKING:
     from lidar_synth.labels.bank import ObjectBank as ObjectBank
     from lidar_synth.labels.draw import draw_objects as draw_objects
-    from lidar_synth.labels.exchange import swap_bands as swap_bands
-    from lidar_synth.labels.exchange import swap_sector as swap_sector
-    from lidar_synth.labels.exchange import thin_scan as thin_scan
-    from lidar_synth.labels.objects import Object as Object
-    from lidar_synth.labels.objects import instances_of as instances_of
-    from lidar_synth.labels.objects import objects_of as objects_of
+    from lidar_synth.labels.exchange import (
+        swap_bands as swap_bands,
+        swap_sector as swap_sector,
+        thin_scan as thin_scan,
+    )
+    from lidar_synth.labels.objects import (
+        Object as Object,
+        instances_of as instances_of,
+        objects_of as objects_of,
+    )
     from lidar_synth.labels.pasting import paste as paste
-    from lidar_synth.labels.policies import POLICIES as POLICIES
-    from lidar_synth.labels.policies import LabelPolicy as LabelPolicy
-    from lidar_synth.labels.policies import make_policy as make_policy
+    from lidar_synth.labels.policies import (
+        POLICIES as POLICIES,
+        LabelPolicy as LabelPolicy,
+        make_policy as make_policy,
+    )
 
 
 def __getattr__(name: str) -> Any:

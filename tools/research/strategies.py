@@ -21,8 +21,7 @@ from model_card import SEED, head, row
 from numpy.typing import NDArray
 from scipy.stats import ttest_rel
 from tqdm import tqdm
-from typer import Argument
-from typer import run as run_command
+from typer import Argument, run as run_command
 
 from lidar_synth.generate.flow.distill import STRATEGIES
 from lidar_synth.generate.flow.solvers import solve

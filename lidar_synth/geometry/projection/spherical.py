@@ -142,7 +142,7 @@ def project(
     nearest_points(
         _checked(scan.points), grid_of(sensor), image.reshape(-1), index.reshape(-1)
     )
-    return RangeImage(image, sensor, carry(scan, index, channels))
+    return RangeImage(image, sensor, carry(scan, index, channels), scan.boxes)
 
 
 def carry(

@@ -72,7 +72,7 @@ def unfold(scan: Scan, sensor: Sensor | None = None) -> RangeImage:
     cell, distance = cells_of(scan.points, grid)
     put_in_rows(cell, laser_rows(scan, lasers), lasers.shape[1])
     image, index = nearest_in(cell, distance, lasers)
-    return RangeImage(image, lasers, carry(scan, index))
+    return RangeImage(image, lasers, carry(scan, index), scan.boxes)
 
 
 def laser_rows(scan: Scan, lasers: Sensor) -> NDArray[np.int64]:

@@ -54,8 +54,7 @@ def adapt(
       lidar-synth adapt town --scans my_scans --out mine.safetensors
       lidar-synth adapt town --scans PandaSet/002 --out mine.safetensors --minutes 60 --dry-run
     """
-    from lidar_synth.lab.train.adaptation import adapt as run
-    from lidar_synth.lab.train.adaptation import plan_adaptation
+    from lidar_synth.lab.train.adaptation import adapt as run, plan_adaptation
 
     given = drop_missing(reading)
     if dry_run:

@@ -128,8 +128,7 @@ def evaluate(
     """
     from lidar_synth.errors import choose
     from lidar_synth.formats import open_scans
-    from lidar_synth.lab.evaluate import PROTOCOLS
-    from lidar_synth.lab.evaluate import evaluate as compare
+    from lidar_synth.lab.evaluate import PROTOCOLS, evaluate as compare
     from lidar_synth.lab.evaluate.features import describe_missing
     from lidar_synth.lab.evaluate.leakage import refuse_training_data
     from lidar_synth.lab.evaluate.published import compare_published as published

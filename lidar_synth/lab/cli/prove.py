@@ -135,8 +135,12 @@ def prove(
     """
     from lidar_synth.files.processes import usable_cores
     from lidar_synth.formats import open_scans
-    from lidar_synth.lab.proof import CommandTrainer, ProofSettings, reference
-    from lidar_synth.lab.proof import prove as run
+    from lidar_synth.lab.proof import (
+        CommandTrainer,
+        ProofSettings,
+        prove as run,
+        reference,
+    )
     from lidar_synth.lab.proof.plan import describe
     from lidar_synth.lab.proof.planning import make_plan
 

@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import KITTI360 as CLASSES
-from lidar_synth.datasets.classes import MAX_INSTANCES
+from lidar_synth.datasets.classes import KITTI360 as CLASSES, MAX_INSTANCES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import list_files, write_file
 from lidar_synth.formats.ply import map_vertices, vertex_header

@@ -23,8 +23,7 @@ from lidar_synth.bake.conditions import conditions, conditions_for
 from lidar_synth.cli.sample import sample
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.disk import sha256
-from lidar_synth.files.recipes import folder as recipes_folder
-from lidar_synth.files.recipes import merge
+from lidar_synth.files.recipes import folder as recipes_folder, merge
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import save_checkpoint
 from lidar_synth.generate.loading import load_generator

@@ -21,8 +21,13 @@ from lidar_synth.lab.town.movers import Mover
 from lidar_synth.lab.town.paving import pave
 from lidar_synth.lab.town.scene import Scene
 from lidar_synth.lab.town.solid import Solid
-from lidar_synth.lab.town.street import KINDS as STREETS
-from lidar_synth.lab.town.street import REACH, SHARES, Street, sample_street
+from lidar_synth.lab.town.street import (
+    KINDS as STREETS,
+    REACH,
+    SHARES,
+    Street,
+    sample_street,
+)
 from lidar_synth.lab.town.traffic import Traffic
 from lidar_synth.lab.town.yards import build_lot
 
