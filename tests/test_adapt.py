@@ -524,6 +524,14 @@ def test_models_that_cannot_be_adapted_are_refused(
         adapt(name, scans, tmp_path / "mine.safetensors")
 
 
+def test_values_for_a_stage_that_is_not_there_are_refused(
+    model: Path, own_scans: list[Scan], tmp_path: Path
+) -> None:
+    folder = write(tmp_path / "scans", own_scans)
+    with pytest.raises(ConfigError, match=r"stage 'flw'.*Did you mean 'flow'"):
+        adapt(model, folder, tmp_path / "mine.safetensors", overrides={"flw": {}})
+
+
 def test_a_model_of_another_architecture_is_refused() -> None:
     header = read_header(find_model("town"))[0]
     other = header.networks["velocity"]._replace(architecture="unet")

@@ -220,6 +220,16 @@ def test_scans_with_boxes_get_the_town_with_boxes(tmp_path: Path) -> None:
     assert len(town) == 1 and town[0].boxes is not None and town[0].label is not None
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [{"scans": 0}, {"scans": 2.5}, {"jobs": 0}, {"minutes": -1}, {"minutes": np.nan}],
+)
+def test_numbers_that_start_refuses(wrong: dict[str, Any], tmp_path: Path) -> None:
+    [name] = wrong
+    with pytest.raises(ConfigError, match=name):
+        lidar_synth.start(tmp_path, tmp_path / "out", dry_run=True, **wrong)
+
+
 def test_what_start_refuses(tmp_path: Path) -> None:
     MAKERS["semantic_kitti"](tmp_path / "scans")
     MAKERS["semantic_kitti"](tmp_path / "others")

@@ -130,6 +130,9 @@ def test_arguments_that_are_no_numbers_of_scans_are_refused(path: Path) -> None:
     for batch in (0, -1, 2.5):
         with pytest.raises(ConfigError, match=f"batch={batch}; expected a number of"):
             load_generator(path, batch=batch)  # type: ignore[arg-type]
+    for dtype in ("float16", torch.int8):
+        with pytest.raises(ConfigError, match="a floating-point type"):
+            load_generator(path, dtype=dtype)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"indices=3; expected a list of them, \[3\]"):
         load_generator(path).scans(0, 3)  # type: ignore[arg-type]
 

@@ -70,6 +70,12 @@ def test_objects_are_their_instances(scans: list[Scan], bank: ObjectBank) -> Non
         assert len(found.scan) >= 0.7 * instance.sum()
 
 
+@pytest.mark.parametrize("scans", [None, [0]])
+def test_objects_are_not_of_a_path(scans: list[int] | None) -> None:
+    with pytest.raises(ConfigError, match="str as a source of scans"):
+        ObjectBank.from_scans("scans", scans=scans)  # type: ignore[arg-type]
+
+
 def test_a_bank_with_a_stray_array_is_read(bank: ObjectBank, tmp_path: Path) -> None:
     bank.save(tmp_path / "objects.npz")
     add_stray(tmp_path / "objects.npz")

@@ -208,8 +208,8 @@ def test_what_only_the_laboratory_imports_is_part_of_it() -> None:
 
 
 LIMITS = {
-    "plugin": (168_130, 5.91, 130),
-    "laboratory": (139_060, 6.0, 130),
+    "plugin": (167_910, 5.91, 130),
+    "laboratory": (139_100, 6.0, 130),
     "tools": (38_370, 5.8, 130),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when

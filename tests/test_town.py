@@ -101,7 +101,14 @@ def test_a_town_is_an_indexable_source() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"seed": -1}, {"scans": -1}, {"interval": 0.0}, {"sensor": "hdl65"}]
+    "options",
+    [
+        {"seed": -1},
+        {"scans": -1},
+        {"scans": 2.5},
+        {"interval": 0.0},
+        {"sensor": "hdl65"},
+    ],
 )
 def test_invalid_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):

@@ -42,7 +42,8 @@ def load_generator(
 
     Raises:
         ConfigError: on an unknown name, an unavailable device, a GPU in a DataLoader worker, a
-            batch below 1, or a number of columns that the model cannot generate.
+            ``dtype`` that is no floating-point type of torch, a batch below 1, or a number of
+            columns that the model cannot generate.
         FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
         LibraryError: on a model on the hub without the extra ``hub``.
 
@@ -53,6 +54,8 @@ def load_generator(
         >>> second.id, sorted(second.fields())
         ('town/0/1', ['confidence', 'label', 'reflectance'])
     """
+    if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
+        raise ConfigError(f"dtype={dtype!r}", "a floating-point type: torch.float16")
     refuse_worker(device)
     device = check_device(device)
     path = find_model(model)

@@ -259,8 +259,11 @@ class Sensor:
         return self.row_elevations()
 
     def row_elevations(self, rays: Rays = "centre") -> NDArray[np.float32]:
-        """(H,) elevation of each row, radians; raises a ConfigError on another word than "centre" or
-        "corner"."""
+        """(H,) elevation of each row, radians.
+
+        Raises:
+            ConfigError: where ``rays`` is neither "centre" nor "corner".
+        """
         if not choose("rays", rays, _OFFSETS):
             return self.edges[:-1].copy()
         if self.elevations is not None:

@@ -154,10 +154,8 @@ class ObjectBank:
             DataError: if there is no object in any of the scans, or the scans have several sensors.
         """
         objects: list[tuple[int, Object]] = []
-        if scans is None:
-            check_source(source)
-            scans = range(len(source))
-        chosen = list(scans)
+        check_source(source)
+        chosen = list(range(len(source)) if scans is None else scans)
         for index in tqdm(
             chosen, "collecting objects", unit="scan", leave=False, disable=None
         ):

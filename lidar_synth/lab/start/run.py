@@ -33,6 +33,7 @@ from lidar_synth.lab.start.trainers import (
     write_mixture,
 )
 from lidar_synth.lab.town import Town
+from lidar_synth.labels.own import check_count
 from lidar_synth.mixing.defaults import LEAST, ends_on_real, quarter_of
 
 MODEL = "town"
@@ -251,6 +252,11 @@ def start(
         >>> sorted(path.name for path in made.files)
         ['mix.yaml']
     """
+    check_count("scans", scans, 1)
+    jobs = usable_cores() if jobs is None else jobs
+    check_count("jobs", jobs, 1)
+    if not minutes >= 0:
+        raise ConfigError(f"minutes={minutes}", "0 or more")
     root = Path(root).resolve()
     out = Path(out).resolve()
     require_outside(out, root)
@@ -260,7 +266,6 @@ def start(
     if task == "detection" and isinstance(found.source, CameraBoxes):
         found = replace(found, source=found.source.with_boxes())
     cast = task == "detection" or _blind(found.source.sensor) > BLIND
-    jobs = jobs or usable_cores()
     plan = StartPlan(found, task, cast, out, scans, minutes, jobs)
     if trainer is not None:
         _configure(plan, trainer)  # complains before anything is made

@@ -54,7 +54,8 @@ class Town:
         sensor: the sensor whose rays are cast, as ``load_sensor`` takes it.
         scans: number of scans.
         interval: seconds between neighbouring scans of a stretch, 0 < interval < 60.
-        noise: the measurement noise of the sensor; by default ``Noise()``.
+        noise: the measurement noise of the sensor; by default
+            ``ReturnNoise()``, with a skin without gains of the lasers.
         motion: whether the vehicle moves while the sensor turns. The points are motion compensated,
             as SemanticKITTI's: in the frame of the scan's pose, each cast from where the sensor
             was. Other objects stand still.
@@ -93,8 +94,8 @@ class Town:
         motion: bool = True,
         skin: str | Path | Skin | None = None,
     ) -> None:
-        whole = int(seed) == seed >= 0
-        if not whole or scans < 0 or not 0 < interval < 60:
+        whole = int(seed) == seed >= 0 and int(scans) == scans >= 0
+        if not whole or not 0 < interval < 60:
             raise ConfigError(
                 f"a town with seed {seed}, {scans} scans and an interval of {interval} s",
                 "seed >= 0, scans >= 0 and 0 < interval < 60 s",
@@ -109,7 +110,7 @@ class Town:
         self._noise = noise or (ReturnNoise(gain_std=0) if self.skin else ReturnNoise())
         driven = STRETCH_FRAMES * interval * FASTEST
         self.apart = max(APART, driven + 2 * self.sensor.range_max)
-        self._scans = scans
+        self._scans = int(scans)
         self._motion = motion
         self._worlds: dict[int, World] = {}
         self._fire()

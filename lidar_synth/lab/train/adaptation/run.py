@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
@@ -27,6 +27,7 @@ from lidar_synth.lab.train.adaptation.regrid import (
 )
 from lidar_synth.lab.train.adaptation.scans import Split, label, prepare, split
 from lidar_synth.lab.train.adaptation.stages import (
+    STAGES,
     AdaptationStage,
     Work,
     shares,
@@ -226,6 +227,8 @@ def adapt(
         3 scans
     """
     plan = plan_adaptation(model, scans, out, minutes, sensor, town, **reading)
+    for name in overrides or {}:
+        choose("stage", name, STAGES)
     require_accelerate()
     claim(plan.work / SETTINGS, _settings(plan))
     prepared = prepare(
