@@ -119,7 +119,8 @@ def project(
             the ``ring`` of other lasers than those of ``sensor``.
 
     Returns:
-        (H, W) range in metres, 0 = no return, with the fields of the nearest points as channels.
+        (H, W) range in metres, 0 = no return, with the fields of the nearest points as channels, and
+        the scan's boxes.
 
     Raises:
         ConfigError: on a channel that the scan does not have.

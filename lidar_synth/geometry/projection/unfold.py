@@ -52,7 +52,8 @@ def unfold(scan: Scan, sensor: Sensor | None = None) -> RangeImage:
         sensor: defines lasers and columns; by default the scan's own sensor.
 
     Returns:
-        An image on ``sensor.by_beams()``, whose rays have the elevations of the lasers.
+        An image on ``sensor.by_beams()``, whose rays have the elevations of the lasers, with the
+        scan's boxes.
 
     Raises:
         DataError: on a scan that is not in ring order: more rings than the sensor has lasers, rings
