@@ -119,7 +119,7 @@ def project(
             the ``ring`` of other lasers than those of ``sensor``.
 
     Returns:
-        (H, W) range in metres, 0 = no return, with the fields of the nearest points as channels, and
+        (H, W) range in metres, 0 = no return, with the fields of the nearest points as channels and
         the scan's boxes.
 
     Raises:
