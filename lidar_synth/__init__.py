@@ -12,9 +12,10 @@ Example:
     (64, 1024)
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
+from lidar_synth.errors import import_name
 from lidar_synth.files.compiled import keep_compiled_code
 
 keep_compiled_code()
@@ -175,13 +176,7 @@ if TYPE_CHECKING:
     from lidar_synth.mixing.settings import mix as mix
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        from lidar_synth.errors import suggest
-
-        hint = f". {suggest(name, _HOME)}".rstrip(". ")
-        raise AttributeError(f"module 'lidar_synth' has no attribute {name!r}{hint}")
-    return getattr(import_module(f"lidar_synth.{_HOME[name]}"), name)
+__getattr__ = partial(import_name, __name__, _HOME)
 
 
 def __dir__() -> list[str]:

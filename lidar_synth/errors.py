@@ -10,7 +10,8 @@ Every message states what was given, what was expected and what to type, in that
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
-from typing import TypeVar
+from importlib import import_module
+from typing import Any, TypeVar
 
 Choice = TypeVar("Choice")
 MISFITS = (
@@ -69,6 +70,23 @@ def suggest(name: object, known: Iterable[str]) -> str:
     """
     near = get_close_matches(str(name), list(known))
     return f"Did you mean {' or '.join(map(repr, near))}?" if near else ""
+
+
+def import_name(package: str, homes: Mapping[str, str], name: str) -> Any:
+    """Import a name of a package when it is first used.
+
+    Args:
+        package: the name of the package.
+        homes: {name: the module below the package that has it}.
+        name: the one that is used.
+
+    Raises:
+        AttributeError: on a name that is not in ``homes``.
+    """
+    if name not in homes:
+        hint = f". {suggest(name, homes)}".rstrip(". ")
+        raise AttributeError(f"module {package!r} has no attribute {name!r}{hint}")
+    return getattr(import_module(f"{package}.{homes[name]}"), name)
 
 
 class DataError(LidarSynthError, ValueError):

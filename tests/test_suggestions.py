@@ -4,6 +4,7 @@ line that names the option or what was expected and, for names, the nearest ones
 import re
 import warnings
 from collections.abc import Collection, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -180,6 +181,24 @@ def test_a_wrong_call_is_answered(call: str, there: dict[str, str]) -> None:
         eval(call, {"lidar_synth": lidar_synth, **there})
     said = str(caught.value)
     assert PYTHON[call] in said and "\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("package", "name"),
+    [
+        ("lidar_synth", "Town"),
+        ("lidar_synth.labels", "paste"),
+        ("lidar_synth.bake", "bake"),
+    ],
+)
+def test_a_wrong_name_of_a_package_is_answered(package: str, name: str) -> None:
+    module = import_module(package)
+    assert getattr(module, name) is not None
+    said = re.escape(
+        f"module {package!r} has no attribute '{name}x'. Did you mean {name!r}"
+    )
+    with pytest.raises(AttributeError, match=said):
+        getattr(module, f"{name}x")
 
 
 @pytest.mark.parametrize("text", YAML)

@@ -9,8 +9,10 @@ Each name is imported when it is first used, so that the command line can read `
 importing torch.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
+
+from lidar_synth.errors import import_name
 
 _HOME = {
     "ENGINES": "run",
@@ -39,8 +41,4 @@ if TYPE_CHECKING:
     from lidar_synth.bake.shard import bake_shard as bake_shard
     from lidar_synth.bake.share import Share as Share
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'lidar_synth.bake' has no attribute {name!r}")
-    return getattr(import_module(f"lidar_synth.bake.{_HOME[name]}"), name)
+__getattr__ = partial(import_name, __name__, _HOME)

@@ -3,8 +3,10 @@
 Each name is imported when it is first used: editing loads networks, which a mixture does not need.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
+
+from lidar_synth.errors import import_name
 
 _HOME = {
     "POLICIES": "policies",
@@ -43,8 +45,4 @@ if TYPE_CHECKING:
         make_policy as make_policy,
     )
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'lidar_synth.labels' has no attribute {name!r}")
-    return getattr(import_module(f"lidar_synth.labels.{_HOME[name]}"), name)
+__getattr__ = partial(import_name, __name__, _HOME)
