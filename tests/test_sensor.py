@@ -2,6 +2,7 @@
 
 import copy
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,16 @@ def test_rows_lie_between_their_edges(sensor: Sensor) -> None:
         assert np.array_equal(corners, s.edges[:-1])
         corners += 1  # of the caller's own array
         assert not np.array_equal(corners, s.edges[:-1])
+
+
+def test_arrays_that_a_sensor_keeps_cannot_be_changed() -> None:
+    sensor = presets()["hdl64e_kitti"]
+    lasers = replace(sensor.by_beams(), heights=(0.1,) * sensor.shape[0])
+    assert len(lasers.starts)
+    for s in (sensor, presets()["town"], lasers):
+        for kept in (s.edges, s.laser_elevations, s.starts, s.ray_directions()):
+            with pytest.raises(ValueError, match="read-only"):
+                kept *= 2
 
 
 @pytest.mark.parametrize("of", ["row_elevations", "column_azimuths", "ray_angles"])

@@ -241,22 +241,20 @@ class Sensor:
         """(H+1,) elevations of the rows' edges, highest first, radians."""
         if self.elevations is None:
             fraction = np.arange(self.shape[0] + 1) / self.shape[0]
-            return np.radians(self.up - fraction * (self.up - self.down)).astype(
-                np.float32
-            )
+            return _shared(np.radians(self.up - fraction * (self.up - self.down)))
         beams = np.asarray(self.elevations)
         between = (beams[1:] + beams[:-1]) / 2
         outer = 2 * beams[[0, -1]] - between[[0, -1]]
         edges: NDArray[np.float64] = np.concatenate([outer[:1], between, outer[1:]])
-        return np.radians(edges).astype(np.float32)
+        return _shared(np.radians(edges))
 
     @cached_property
     def laser_elevations(self) -> NDArray[np.float32]:
         """(H,) elevation of each laser, highest first, radians: ``beams`` if they are given,
         otherwise the rows."""
         if self.beams is not None:
-            return np.radians(self.beams).astype(np.float32)
-        return self.row_elevations()
+            return _shared(np.radians(self.beams))
+        return _shared(self.row_elevations())
 
     def row_elevations(self, rays: Rays = "centre") -> NDArray[np.float32]:
         """(H,) elevation of each row, radians.
@@ -328,8 +326,8 @@ class Sensor:
             or self.beams is not None
             or not any(self.heights or ())
         ):
-            return np.empty(0, np.float32)
-        return np.asarray(self.heights, np.float32)
+            return _shared(())
+        return _shared(self.heights)
 
     def firing_azimuths(self) -> NDArray[np.float64]:
         """(H, F) azimuth of each laser at each of its firings, radians, in the order of firing from
@@ -432,9 +430,14 @@ def _ray_directions(sensor: Sensor, rays: Rays) -> NDArray[np.float32]:
             np.sin(elevation),
         ]
     )
-    directions = np.ascontiguousarray(np.moveaxis(rays_xyz, 0, -1), np.float32)
-    directions.setflags(write=False)
-    return directions
+    return _shared(np.moveaxis(rays_xyz, 0, -1))
+
+
+def _shared(values: Any) -> NDArray[np.float32]:
+    """New values as a read-only float32 array, which callers share."""
+    array = np.ascontiguousarray(values, np.float32)
+    array.setflags(write=False)
+    return array
 
 
 def _plain(value: Any) -> Any:

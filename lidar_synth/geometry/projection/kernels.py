@@ -89,8 +89,9 @@ def grid_of(sensor: Sensor) -> Grid:
     up = np.radians(_f(sensor.up))
     down = np.radians(_f(sensor.down))
     none = np.empty(0, np.float32)
-    edges = sensor.edges if sensor.elevations is not None else none
-    starts = sensor.starts
+    # Copies: torch warns of read-only arrays, and numba would compile for them once more.
+    edges = sensor.edges.copy() if sensor.elevations is not None else none
+    starts = sensor.starts.copy()
     slopes = lifts = none
     if len(starts):
         slopes = np.tan(edges)
