@@ -172,7 +172,7 @@ class Boxes:
     def contain(
         self, points: NDArray[np.float32], above_floor: float = 0.0
     ) -> NDArray[np.bool_]:
-        """(M, N) bool: which points lie inside each box, its faces included.
+        """(M, N) bool: which points lie inside each box, its faces included up to rounding.
 
         Args:
             points: (N, 3) metres, in the boxes' frame.
