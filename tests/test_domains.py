@@ -321,6 +321,17 @@ def test_points_of_a_batch_need_a_domain_each() -> None:
     assert torch.allclose(out[start:], last(batch["points"][start:]), atol=1e-5)
 
 
+def test_domains_are_real_or_synthetic_and_a_batch_may_be_empty() -> None:
+    layer = ByDomain(torch.nn.Linear(4, 8))
+    layer.domain = torch.tensor([0, 1, 2])
+    with pytest.raises(
+        ConfigError, match=r"3 domains.*2 of them 0 or 1; .*0 real or 1"
+    ):
+        layer(torch.zeros(3, 4))
+    layer.domain = torch.zeros(0)
+    assert layer(torch.zeros(0, 4)).shape == (0, 8)
+
+
 def test_reflectance_is_dropped_by_chance() -> None:
     rng = np.random.default_rng(0)
     scan = REAL[0]

@@ -125,21 +125,23 @@ class ByDomain(nn.Module):
         """The output (B, ...) of each sample (B, ...) by the layer of its domain.
 
         Raises:
-            ConfigError: on another number of samples than of domains.
+            ConfigError: on another number of samples than of domains, or a domain that is neither 0
+                nor 1.
         """
         if self.domain is None:
             return self.layers[0](x)  # type: ignore[no-any-return]
-        if len(self.domain) != len(x):
+        by_domain = [torch.nonzero(self.domain == number)[:, 0] for number in (0, 1)]
+        known = sum(map(len, by_domain))
+        if not known == len(self.domain) == len(x):
             raise ConfigError(
-                f"{len(self.domain)} domains for {len(x)} rows",
-                "a domain for each row",
+                f"{len(self.domain)} domains for {len(x)} rows, {known} of them 0 or 1",
+                "a domain for each row, 0 real or 1 synthetic",
                 "For concatenated points: "
                 'batch["domain"].repeat_interleave(batch["offsets"].diff()).',
             )
-        by_domain = [torch.nonzero(self.domain == number)[:, 0] for number in (0, 1)]
         parts = [
             layer(x[indices])
             for layer, indices in zip(self.layers, by_domain, strict=True)
-            if len(indices)
+            if len(indices) or not known
         ]
         return torch.cat(parts)[torch.argsort(torch.cat(by_domain))]
