@@ -107,3 +107,22 @@ def test_an_instance_number_that_is_used_again_is_another_object() -> None:
         *(np.concatenate([getattr(one, n), getattr(other, n)]) for n in vars(one))
     )
     assert len(Movers([], both, range(9)).tracks) == 2
+
+
+def test_points_of_a_turning_object_follow_its_box(tmp_path: Path) -> None:
+    boxes = _moving_box(range(2), 0.0)
+    turn = np.array([(0, -1, 0), (1, 0, 0), (0, 0, 1)])
+    boxes.transforms[1, :3, :3] = turn @ boxes.transforms[1, :3, :3]
+    boxes.transforms[1, :3, 3] = 10, 0, 0
+    for given, frame, expected in (
+        ((1, 0.5, 0, 0), 1, (9.5, 1, 0)),
+        ((9.5, 1, 0, 1), 0, (1, 0.5, 0)),
+    ):
+        cloud = _dynamic([given], tmp_path / str(frame) / "dynamic" / "a.ply")
+        [point] = Movers([cloud], boxes, range(2)).at(frame)[0]
+        assert point == pytest.approx(expected, abs=1e-5)
+
+
+def test_an_object_that_is_seen_rarely_stays_one_object() -> None:
+    """As fast as 10 m a frame, with a box in every third frame."""
+    assert len(Movers([], _moving_box(range(0, 9, 3), 10.0), range(9)).tracks) == 1

@@ -117,3 +117,35 @@ def test_what_the_town_owes_to_real_labels_is_named_once(seen: str) -> None:
     for row in proof.values["arms"][1:]:
         assert row["budget"].count(CALIBRATED_ON) == 1
         assert "labels of the town, which cost nothing" in row["budget"]
+
+
+def test_every_place_counts_alike_however_many_seeds_it_has() -> None:
+    arms = rows(("exchange",), (0.5,))
+    gains = {("p0", 0): 500, ("p0", 1): 500, ("p1", 0): 300}
+    found = {
+        pair: {
+            arm: outcome(gain if arm.name == "exchange" else 300, 1000) for arm in arms
+        }
+        for pair, gain in gains.items()
+    }
+    row = summarise(a_plan(arms, ["p0", "p1"], 2), found, {}, "reference").values[
+        "arms"
+    ][1]
+    assert row["difference"] == pytest.approx(10) and row["miou"] == pytest.approx(40)
+
+
+def test_the_arm_is_chosen_on_the_other_places() -> None:
+    """One that is best at one place alone, by much, is not chosen there."""
+    arms = rows(("pretrain", "town"), (0.5,))
+    names = [f"p{i}" for i in range(4)]
+    persons = {"real": [300] * 4, "pretrain": [310] * 4, "town": [900, 200, 200, 200]}
+    found = {
+        (name, 0): {arm: outcome(persons[arm.name][i], 1000) for arm in arms}
+        for i, name in enumerate(names)
+    }
+    chosen = summarise(a_plan(arms, names), found, {}, "reference").values[
+        "chosen_elsewhere"
+    ]
+    keys = {arm.name: arm.key for arm in arms}
+    assert chosen["arms"] == [keys["pretrain"]] + [keys["town"]] * 3
+    assert chosen["difference"] == pytest.approx((1 - 3 * 10) / 4)
