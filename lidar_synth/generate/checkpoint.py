@@ -144,8 +144,8 @@ class Header:
         )
 
     def match(self, state: Tensor, grid: Sequence[float]) -> Tensor:
-        """The result (B, C, rows, columns) of a time grid, with the moments of those of
-        ``time_grid``, where they were measured."""
+        """The result (B, C, rows, columns) of a time grid, scaled and shifted towards the moments
+        of those of ``time_grid``, where these were measured."""
         steps = len(grid) - 1
         if str(steps) not in self.matches or grid != self.grid(steps):
             return state

@@ -54,8 +54,8 @@ class Town:
         sensor: the sensor whose rays are cast, as ``load_sensor`` takes it.
         scans: number of scans.
         interval: seconds between neighbouring scans of a stretch, 0 < interval < 60.
-        noise: the measurement noise of the sensor; by default
-            ``ReturnNoise()``, with a skin without gains of the lasers.
+        noise: the measurement noise of the sensor; by default ``ReturnNoise()``, beside a skin,
+            which has the lasers' gains, ``ReturnNoise(gain_std=0)``.
         motion: whether the vehicle moves while the sensor turns. The points are motion compensated,
             as SemanticKITTI's: in the frame of the scan's pose, each cast from where the sensor
             was. Other objects stand still.

@@ -21,7 +21,7 @@ BATCH = 8
 def measure_matches(
     network: nn.Module, header: Header, noise: Tensor, conditions: Tensor | None
 ) -> dict[str, Any]:
-    """The ``matches`` of a header: what gives states in fewer steps the moments of those in the
+    """The ``matches`` of a header: ``match_moments`` of states in fewer steps and of those in the
     steps of ``time_grid``.
 
     Args:

@@ -150,17 +150,18 @@ def interval_of(own: Groups, base: Groups, tested: Tested) -> tuple[float, float
     """
     rng = np.random.default_rng(0)
     places = list(map(list, tested.values()))
-    names = sorted({name for of_seed in places for name in of_seed})
+    names = sorted(set[str]().union(*places))
 
-    def draw() -> float:
+    def draw() -> list[float]:
         drawn = rng.choice(names, len(names))
         changes = []
         for seed in rng.integers(0, len(places), len(places)):
             kept = [places[seed].index(name) for name in drawn if name in places[seed]]
             made, before = ([arm[seed][i] for i in kept] for arm in (own, base))
             changes.append(_percent(made) - _percent(before))
-        return float(np.mean(changes))
+        return changes
 
-    values = [draw() for _ in range(DRAWS)]
-    low, high = np.nanquantile(values, expanded_quantiles(len(names)))
+    # A seed without a drawn place with a box has no difference.
+    drawn = np.ma.masked_invalid([draw() for _ in range(DRAWS)]).mean(1).compressed()
+    low, high = np.quantile(drawn, expanded_quantiles(len(names)))
     return round(float(low), 1), round(float(high), 1)
