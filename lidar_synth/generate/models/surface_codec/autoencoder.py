@@ -26,6 +26,7 @@ from lidar_synth.generate.models.surface_codec.blocks import (
 )
 from lidar_synth.generate.models.surface_codec.bounds import bounds_of, codes_of
 from lidar_synth.generate.models.surface_codec.measure_noise import Seen, measure_noise
+from lidar_synth.generate.models.surface_codec.planes import share_planes
 from lidar_synth.generate.models.surface_codec.relief import SPANS, relief_fields
 from lidar_synth.generate.models.surface_codec.surfaces import (
     DRAWS,
@@ -253,7 +254,8 @@ class SurfaceAutoencoder(BoundedAutoencoder):
             )
         merged = self.resolution[1] // columns
         patch = PATCH[0], PATCH[1] // merged
-        surfaces = self.expand(self.bounded(z), merged)
+        grid = self.resolution[0] // PATCH[0], columns // patch[1]
+        surfaces = share_planes(self.expand(self.bounded(z), merged), grid, patch)
         relief = relief_fields(uniform_noise[:, -1], merged)
         drawn = to_patches(uniform_noise, patch), to_patches(relief, patch)
         given = given or {}
