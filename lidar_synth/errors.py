@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
+from numbers import Integral
 from typing import Any, TypeVar
 
 Choice = TypeVar("Choice")
@@ -121,6 +122,17 @@ def choose(kind: str, name: str, table: Mapping[str, Choice], hint: str = "") ->
             f"{kind} {name!r}", f"one of {', '.join(map(repr, table))}", hint
         )
     return table[name]
+
+
+def check_count(name: str, value: int, least: int) -> None:
+    """Check that ``value`` is a whole number of at least ``least``.
+
+    Raises:
+        ConfigError: on any other value.
+    """
+    if not (isinstance(value, Integral) and value >= least):
+        given = f"{name} {shorten(repr(value), 40)}"
+        raise ConfigError(given, f"a whole number, {least} or more")
 
 
 @contextmanager

@@ -545,7 +545,7 @@ def test_shards_of_small_banks_are_small(
             ["--engine", "dask"],
             "engine 'dask'; expected one of 'local', 'processes', 'ray'",
         ),
-        (["--workers", "0"], "0 workers; expected at least 1"),
+        (["--workers", "0"], "workers 0; expected a whole number"),
         (
             ["--shard-index", "3", "--num-shards", "3"],
             "--shard-index 3 of --num-shards 3",

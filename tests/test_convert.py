@@ -221,8 +221,10 @@ def test_a_full_target_stops_the_run_for_every_policy(tmp_path: Path) -> None:
             on_bad="skip",
             progress=False,
         )
-    with pytest.raises(ConfigError, match="0 jobs; expected at least 1"):
-        convert([some_scan()], WRITERS["npz"](tmp_path / "out"), jobs=0)
+    for jobs in (0, 1.5):
+        message = f"jobs {jobs}; expected a whole number, 1 or more"
+        with pytest.raises(ConfigError, match=message):
+            convert([some_scan()], WRITERS["npz"](tmp_path / "out"), jobs=jobs)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", presets())
@@ -335,7 +337,7 @@ WRONG = {
         ["--as-sensor", "os1_128", "--mount", "9,0"],
         "at most 5 m",
     ),
-    "fewer than no sweeps": (["--as-sensor", "os1_128", "--sweeps", "-1"], "-1 sweeps"),
+    "fewer than no sweeps": (["--as-sensor", "os1_128", "--sweeps", "-1"], "sweeps -1"),
     "noise of metres": (
         ["--as-sensor", "os1_128", "--range-noise", "2"],
         "range_noise=2",

@@ -212,9 +212,10 @@ def test_a_reference_replaces_the_mean_histograms(tmp_path: Path) -> None:
     assert np.array_equal(values["empty"], score(bank, progress=False).values["empty"])
     write_bank(tmp_path / "blind", [images_with("range")[13]], fields=())
     assert "labels" not in score(bank, Bank(tmp_path / "blind"), progress=False).values
-    for wrong in ({"jobs": 0}, {"reference": []}):
-        with pytest.raises(ConfigError, match="at least one job, and one scan"):
-            score(bank, **wrong)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="jobs 0; expected a whole number"):
+        score(bank, jobs=0)
+    with pytest.raises(ConfigError, match="scans of the reference 'odd' 0"):
+        score(bank, [], name="odd")
 
 
 def test_scores_do_not_depend_on_processes_and_are_saved(tmp_path: Path) -> None:

@@ -128,7 +128,9 @@ def test_an_unknown_sampling_option_is_refused(generator: Generator) -> None:
 
 def test_arguments_that_are_no_numbers_of_scans_are_refused(path: Path) -> None:
     for batch in (0, -1, 2.5):
-        with pytest.raises(ConfigError, match=f"batch={batch}; expected a number of"):
+        with pytest.raises(
+            ConfigError, match=f"batch {batch}; expected a whole number"
+        ):
             load_generator(path, batch=batch)  # type: ignore[arg-type]
     for dtype in ("float16", torch.int8):
         with pytest.raises(ConfigError, match="a floating-point type"):
@@ -178,7 +180,7 @@ def test_steps_and_solver_replace_the_checkpoints_own_grid(
     with pytest.raises(ConfigError, match="one of the two"):
         list(generator.samples(0, [0], times=given, steps=2))
     for steps in (0, 2.5):
-        with pytest.raises(ConfigError, match=f"{steps} steps; expected a whole"):
+        with pytest.raises(ConfigError, match=f"steps {steps}; expected a whole"):
             generator.scans(0, [0], steps=steps)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="solver 'rk4'"):
         generator.scans(0, [0], solver="rk4")

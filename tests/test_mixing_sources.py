@@ -132,7 +132,7 @@ def test_a_cache_keeps_the_latest(
     assert source[0] is source[0]
     [source[i] for i in (1, 0, 2, 0, 1)]
     assert made == [0, 1, 2, 1]
-    with pytest.raises(ConfigError, match="cache=-1"):
+    with pytest.raises(ConfigError, match="cache -1"):
         Generated(generator, cache=-1)
     with pytest.raises(ConfigError, match="option 'stepz'.* Did you mean 'steps'"):
         Generated(generator, stepz=1)

@@ -544,7 +544,8 @@ def test_the_remaining_samples_do_not_depend_on_the_number_of_ranks() -> None:
             r"ratio 1 in epoch 110 .*epoch_size='add'",
         ),
         (lambda: mixture(epoch_size=0), ConfigError, r"epoch_size=0"),
-        (lambda: mixture(reuse=0), ConfigError, r"reuse=0"),
+        (lambda: mixture(reuse=0), ConfigError, r"reuse 0"),
+        (lambda: mixture(reuse=1.5), ConfigError, r"reuse 1\.5; expected a whole"),
         (lambda: mixture(seed=-1), ConfigError, r"seed -1"),
         (lambda: mixture(real=0), DataError, r"a source without scans"),
         (

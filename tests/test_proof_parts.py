@@ -456,7 +456,11 @@ BAD = {
         "places by 'street'; expected one of auto, drive",
     ),
     "no number of stretches": (drives(), {"places": "drive:2"}, "places by 'drive:2'"),
-    "no labelled scan": (drives(), {"labelled": 0}, "labelled=0; expected 1 or more"),
+    "no labelled scan": (
+        drives(),
+        {"labelled": 0},
+        "labelled 0; expected a whole number, 1 or more",
+    ),
     "more labelled than there are": (
         drives(),
         {"labelled": 9},

@@ -187,6 +187,6 @@ def test_an_unknown_solver_and_zero_steps_are_refused() -> None:
     with pytest.raises(ConfigError, match="solver 'rk4'; expected one of euler, heun"):
         solve(gaussian_velocity, NOISE, (1.0, 0.0), "rk4")
     with pytest.raises(
-        ConfigError, match="0 steps; expected a whole number, at least 1"
+        ConfigError, match="steps 0; expected a whole number, 1 or more"
     ):
         uniform_grid(0)

@@ -108,7 +108,7 @@ YAML = {
     "{synthetic: BANK, labels: generatd}": "Did you mean 'generated'",
     "{synthetic: BANK, as_sensor: os1_12}": "Did you mean 'os1_128'",
     "{synthetic: BANK, unboxed: clos}": "Did you mean 'close'",
-    "{synthetic: BANK, reuse: 0}": "at least 1",
+    "{synthetic: BANK, reuse: 0}": "1 or more",
     "{synthetic: BANK, seed: one}": "expected an integer",
     "{synthetic: twon}": "Did you mean 'town'",
     "{ratio: 0.5}": "synthetic: a bank's folder",

@@ -305,7 +305,7 @@ def test_scans_and_their_folder_name_their_skin_and_its_licence(tmp_path: Path) 
             None,
             "layout 'kitti-360'; expected .*Did you mean 'kitti360'",
         ),
-        ("kitti360", 0, None, "^0 jobs"),
+        ("kitti360", 0, None, "^jobs 0"),
         ("kitti360", 1, 100, "sequence 100"),
     ],
 )

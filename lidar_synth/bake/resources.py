@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import check_count
 
 
 @dataclass(frozen=True)
@@ -25,5 +25,4 @@ class Resources:
     slurm: dict[str, str | int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise ConfigError(f"{self.workers} workers", "at least 1")
+        check_count("workers", self.workers, 1)

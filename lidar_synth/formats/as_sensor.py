@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, check_count
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry import Scan, Sensor, Source, load_sensor
@@ -37,10 +37,7 @@ class AsSensor:
     sweeps: int = 0
 
     def __post_init__(self) -> None:
-        if self.sweeps < 0:
-            raise ConfigError(
-                f"{self.sweeps} sweeps", "a number of scans before and after each scan"
-            )
+        check_count("sweeps", self.sweeps, 0)
 
     def cast(self, scan: Scan, source: Source, index: int) -> Transferred:
         """The scan at ``index`` of a source, which has been read; its noise depends on the index.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 from lidar_synth.bank import is_url
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, check_count
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats import OnBad, ScanFiles, Writer
@@ -129,8 +129,7 @@ def convert(
         DataError: on a bad scan, unless ``on_bad="skip"``; if what lies beside the scans is
             damaged.
     """
-    if jobs < 1:
-        raise ConfigError(f"{jobs} jobs", "at least 1")
+    check_count("jobs", jobs, 1)
     change = _change(as_sensor)
     models = []
     if isinstance(source, ScanFiles):

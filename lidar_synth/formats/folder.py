@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
-from lidar_synth.errors import ConfigError, DataError, FileError, parsing
+from lidar_synth.errors import ConfigError, DataError, FileError, check_count, parsing
 from lidar_synth.files.disk import files_below, read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.formats.cloud import (
@@ -160,8 +160,7 @@ class Folder(CloudFiles):
         reflectance_max: float | None = None,
         on_bad: OnBad = "error",
     ) -> None:
-        if fields < 4:
-            raise ConfigError(f"fields={fields}", "at least 4")
+        check_count("fields", fields, 4)
         self._reflectance_max = check_scale(reflectance_max)
         root = Path(root)
         ids, self._paths = scan_paths(root, SUFFIXES)

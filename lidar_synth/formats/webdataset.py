@@ -33,7 +33,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError, LidarSynthError, parsing, shorten
+from lidar_synth.errors import DataError, LidarSynthError, check_count, parsing, shorten
 from lidar_synth.files.disk import (
     SKIP_HINT,
     list_files,
@@ -124,8 +124,7 @@ class WebDatasetWriter(FileWriter):
         calibration: Calibration | None = None,
     ) -> None:
         super().__init__(root, calibration=calibration)
-        if shard_size < 1:
-            raise ConfigError(f"{shard_size} scans in a tar file", "at least 1")
+        check_count("shard_size", shard_size, 1)
         self.shard_size = shard_size
         self._there: set[str] | None = None
 

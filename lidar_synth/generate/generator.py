@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from typing_extensions import Unpack
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError, choose
+from lidar_synth.errors import ConfigError, DataError, check_count, choose
 from lidar_synth.files.hub import Repository, push
 from lidar_synth.generate import boxed
 from lidar_synth.generate.card import model_card
@@ -106,8 +106,7 @@ class Generator:
     path: Path | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.batch, int | np.integer) or self.batch < 1:
-            raise ConfigError(f"batch={self.batch}", "a number of scans, at least 1")
+        check_count("batch", self.batch, 1)
         widths = getattr(self.autoencoder, "widths", (self.header.sensor.columns,))
         if self.columns is not None and self.columns not in widths:
             raise ConfigError(
@@ -481,8 +480,7 @@ class Generated:
         cache: int = 0,
         **sampling: Any,
     ) -> None:
-        if cache < 0:
-            raise ConfigError(f"cache={cache}", "a number of scans")
+        check_count("cache", cache, 0)
         for name in sampling:
             choose("sampling option", name, _OPTIONS)
         conditioned = condition is not None and len(condition) > 0

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import BOXED
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, check_count
 from lidar_synth.geometry import Scan, Source, check_source
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.edit.redraw import open_model
@@ -23,7 +23,6 @@ from lidar_synth.labels.edit.unboxed import remove_unboxed
 from lidar_synth.labels.exchange import swap_bands, swap_sector, thin_scan
 from lidar_synth.labels.objects import THINGS, Object, instances_of, objects_of
 from lidar_synth.labels.own import (
-    check_count,
     check_own,
     check_share,
     keep_own,

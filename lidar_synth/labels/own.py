@@ -6,7 +6,7 @@ which would contradict the labels that they set.
 """
 
 from dataclasses import dataclass, replace
-from numbers import Integral, Real
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,17 +236,6 @@ def check_share(name: str, value: float, most: float = 1) -> float:
         given = f"{name} {shorten(repr(value), 40)}"
         raise ConfigError(given, f"a number from 0 to {most:g}")
     return value
-
-
-def check_count(name: str, value: int, least: int) -> None:
-    """Check that ``value`` is a whole number of at least ``least``.
-
-    Raises:
-        ConfigError: on any other value.
-    """
-    if not (isinstance(value, Integral) and value >= least):
-        given = f"{name} {shorten(repr(value), 40)}"
-        raise ConfigError(given, f"a whole number, {least} or more")
 
 
 def require_label(policy: str, fields: frozenset[str]) -> None:

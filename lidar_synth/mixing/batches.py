@@ -12,8 +12,7 @@ from typing import Any
 
 from torch.utils.data import Sampler
 
-from lidar_synth.errors import ConfigError
-from lidar_synth.labels.own import check_count
+from lidar_synth.errors import ConfigError, check_count
 from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, Position
 from lidar_synth.mixing.state import (
     Divided,

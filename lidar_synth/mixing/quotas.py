@@ -24,7 +24,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, check_count
 from lidar_synth.geometry.arrays import Int64Array
 from lidar_synth.mixing.schedules import Schedule, Steps, constant_from, share_of
 
@@ -95,11 +95,7 @@ class Mixture:
             raise ConfigError(
                 f"epoch_size={size!r}", "'add', 'replace' or a number of samples"
             )
-        if self.reuse < 1:
-            raise ConfigError(
-                f"reuse={self.reuse}",
-                "the number of epochs that use a synthetic scan, at least 1",
-            )
+        check_count("reuse", self.reuse, 1)
         if not 0 <= self.seed < 2**64:
             raise ConfigError(f"seed {self.seed}", "0 <= seed < 2^64")
         for source in self.real + self.synthetic:

@@ -8,8 +8,7 @@ from typing import Any
 
 from torch.utils.data import IterableDataset, get_worker_info
 
-from lidar_synth.errors import ConfigError
-from lidar_synth.labels.own import check_count
+from lidar_synth.errors import ConfigError, check_count
 from lidar_synth.mixing.batches import (
     AHEAD,
     CutSteps,

@@ -30,7 +30,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, check_count
 from lidar_synth.generate.flow.path import Example, Velocity, interpolate, per_sample
 from lidar_synth.generate.flow.solvers import check_grid, solve, uniform_grid
 
@@ -172,8 +172,7 @@ def every_piece(
     Raises:
         ConfigError: on fewer than one step, or a grid that does not descend within [0, 1].
     """
-    if steps < 1:
-        raise ConfigError(f"{steps} steps of the teacher", "at least 1")
+    check_count("steps of the teacher", steps, 1)
     pieces = [(a, b) for grid in grids for a, b in pairwise(check_grid(grid).tolist())]
     evaluations = 0
     total = steps * (len(grids[0]) - 1)
@@ -246,8 +245,7 @@ def _slope(
 ) -> Tensor:
     """(B, ...) constant velocity between y at ``start`` and the state that the teacher reaches at
     ``end``."""
-    if steps < 1:
-        raise ConfigError(f"{steps} steps of the teacher", "at least 1")
+    check_count("steps of the teacher", steps, 1)
     shares = torch.linspace(0, 1, steps + 1, dtype=start.dtype, device=start.device)
     times = torch.lerp(start[None], end[None], shares[:, None])
     with torch.no_grad():

@@ -9,13 +9,12 @@ order.
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, check_count
 from lidar_synth.generate.flow.path import Velocity, per_sample
 
 Grid = Sequence[float] | Tensor
@@ -76,8 +75,7 @@ def uniform_grid(steps: int, start: float = 1.0, end: float = 0.0) -> tuple[floa
     Raises:
         ConfigError: on fewer than one step, or a part of one.
     """
-    if not isinstance(steps, Integral) or steps < 1:
-        raise ConfigError(f"{steps} steps", "a whole number, at least 1")
+    check_count("steps", steps, 1)
     return tuple((start * (steps - i) + end * i) / steps for i in range(steps + 1))
 
 

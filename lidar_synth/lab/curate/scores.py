@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from lidar_synth.bank import Bank
 from lidar_synth.datasets.classes import NAMES
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import DataError, check_count
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.files.processes import map_in_processes
@@ -93,10 +93,9 @@ def score(
         ConfigError: on fewer than one job, or an empty reference.
         DataError, FileError: if a scan cannot be read, or the folder cannot be written.
     """
-    if jobs < 1 or (reference is not None and len(reference) == 0):
-        raise ConfigError(
-            f"{jobs} jobs, a reference of {name!r}", "at least one job, and one scan"
-        )
+    check_count("jobs", jobs, 1)
+    if reference is not None:
+        check_count(f"scans of the reference {name!r}", len(reference), 1)
     with TemporaryDirectory() as temporary:
         store = measure(bank, folder or Path(temporary), jobs, progress)
         if reference is None:

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import DataError, check_count
 from lidar_synth.lab.evaluate.distances import checked_features
 from lidar_synth.lab.evaluate.statistics import Statistic, share
 
@@ -54,8 +54,7 @@ def manifold(
         DataError: as ``frechet_distance``, or with k or fewer samples in a set.
     """
     x, y = (torch.from_numpy(s) for s in checked_features(real, fake))
-    if k < 1:
-        raise ConfigError(f"neighbour k = {k}", "at least 1")
+    check_count("k", k, 1)
     if min(len(x), len(y)) <= k:
         raise DataError(
             f"{len(x)} real and {len(y)} generated samples",

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import KITTI360 as CLASSES
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, check_count
 from lidar_synth.files.disk import read_text, remove_file, sha256, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.files.processes import map_in_processes
@@ -191,8 +191,7 @@ def label_scans(
     """
     root = Path(root)
     out = Path(out)
-    if jobs < 1:
-        raise ConfigError(f"{jobs} jobs", "at least 1")
+    check_count("jobs", jobs, 1)
     for cached in (_poses, _boxes, _hash):
         cached.cache_clear()  # files may have changed since an earlier call
     plan = plan_labels(root, split)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import check_count
 
 MOST_LABELLED = 200
 """Labelled scans that are trained on if no number is given."""
@@ -63,10 +63,8 @@ class ProofSettings:
     beams: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "batch", "seeds", "tested", "synthetic"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)}", "1 or more")
-        if self.iterations < 10:
-            raise ConfigError(f"iterations={self.iterations}", "10 or more")
-        if self.labelled is not None and self.labelled < 1:
-            raise ConfigError(f"labelled={self.labelled}", "1 or more")
+        for name in ("batch", "seeds", "tested", "synthetic"):
+            check_count(name, getattr(self, name), 1)
+        check_count("iterations", self.iterations, 10)
+        if self.labelled is not None:
+            check_count("labelled", self.labelled, 1)

@@ -11,7 +11,7 @@ import numpy as np
 
 from lidar_synth.bake import BakeJob, BakePlan, Resources, bake, make_plan
 from lidar_synth.bake.estimate import estimate
-from lidar_synth.errors import ConfigError, DataError, choose
+from lidar_synth.errors import ConfigError, DataError, check_count, choose
 from lidar_synth.files.claims import claim, hold_writing, require_outside
 from lidar_synth.files.disk import write_file
 from lidar_synth.files.processes import usable_cores
@@ -33,7 +33,6 @@ from lidar_synth.lab.start.trainers import (
     write_mixture,
 )
 from lidar_synth.lab.town import Town
-from lidar_synth.labels.own import check_count
 from lidar_synth.mixing.defaults import LEAST, ends_on_real, quarter_of
 
 MODEL = "town"

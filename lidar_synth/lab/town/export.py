@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lidar_synth.errors import ConfigError, choose
+from lidar_synth.errors import ConfigError, check_count, choose
 from lidar_synth.files.claims import claim, hold_writing
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.markdown import escape_markdown
@@ -88,8 +88,7 @@ def export_town(
     if layout == "kitti":
         layout = "kitti_object"
     choose("layout", layout, LAYOUTS)
-    if jobs < 1:
-        raise ConfigError(f"{jobs} jobs", "at least 1")
+    check_count("jobs", jobs, 1)
     number = SEQUENCES.get(layout, 0) if sequence is None else sequence
     if not 0 <= number < 100:
         raise ConfigError(f"sequence {number}", "0 to 99")

@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from lidar_synth.bank.encoding import Encoding
-from lidar_synth.errors import ConfigError, choose
+from lidar_synth.errors import ConfigError, check_count, choose
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model, load_generator
 from lidar_synth.geometry import SYNTHETIC, Scan, model_provenance
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.labels.own import check_count
 from lidar_synth.mixing.service.client import Client
 from lidar_synth.mixing.service.ledger import COUNTERS, Starved
 from lidar_synth.mixing.service.process import (

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from lidar_synth.errors import ConfigError, DataError, parsing, suggest
+from lidar_synth.errors import ConfigError, DataError, check_count, parsing, suggest
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names, write_file
 from lidar_synth.files.parsing import read_sealed, seal
@@ -90,8 +90,7 @@ class DetectionSettings:
 
     def __post_init__(self) -> None:
         for name in ("labelled", "iterations", "batch", "seeds", "synthetic"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)}", "1 or more")
+            check_count(name, getattr(self, name), 1)
         if unknown := [name for name in self.arms if name not in ARMS]:
             raise ConfigError(
                 f"arm {', '.join(map(repr, unknown))}",
