@@ -203,9 +203,18 @@ def _words(
     return philox(torch.stack(counter), seed), count
 
 
-def _check(seed: int, indices: Sequence[int], shape: Sequence[int]) -> None:
+def check_seed(seed: int) -> None:
+    """Check that ``seed`` is an integer, 0 <= seed < 2^64.
+
+    Raises:
+        ConfigError: on any other value.
+    """
     if not isinstance(seed, SupportsIndex) or not 0 <= seed < 2**64:
-        raise ConfigError(f"seed {seed}", "0 <= seed < 2^64, an integer")
+        raise ConfigError(f"seed {seed!r}", "0 <= seed < 2^64, an integer")
+
+
+def _check(seed: int, indices: Sequence[int], shape: Sequence[int]) -> None:
+    check_seed(seed)
     for i in indices:
         if not isinstance(i, SupportsIndex) or not 0 <= i < 2**63:
             raise ConfigError(f"index {i}", "0 <= index < 2^63, an integer")

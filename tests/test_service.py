@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import hypothesis.strategies as st
 import numpy as np
@@ -25,7 +26,7 @@ from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.mixing import MixedScans, Sources
-from lidar_synth.mixing.service import BatchMixer, RollingBank
+from lidar_synth.mixing.service import BatchMixer, RollingBank, rolling
 from lidar_synth.mixing.service.slots import Slots
 from lidar_synth.mixing.state import make_state
 
@@ -265,10 +266,20 @@ def test_invalid_options_and_requests_are_refused(
         ({"seed": -1}, "seed -1"),
         ({"starved": "skip"}, r"starved='skip'; expected one of \('wait', 'reuse'\)"),
         ({"refresh": 1.5}, r"refresh=1.5; expected a share in \(0, 1\]"),
+        ({"timeout": "1"}, "timeout='1'; expected more than 0 seconds"),
+        ({"seed": 1.5}, "seed 1.5; expected .*an integer"),
+        ({"threads": 1.5}, "threads 1.5; expected a whole number, 1 or more"),
+        ({"steps": 0}, "steps 0; expected a whole number, 1 or more"),
+        ({"steps": 2.5}, "steps 2.5; expected a whole number, 1 or more"),
+        ({"solver": "rk4"}, "solver 'rk4'; expected one of 'euler', 'heun'"),
+        ({"batch": 0}, "batch 0; expected a whole number, 1 or more"),
+        ({"columns": 78}, "78 columns of 'small'; expected one of 32"),
     ]
-    for options, message in refusals:
-        with pytest.raises(ConfigError, match=message):
-            RollingBank(path, **options)
+    # No process is started for them.
+    with patch.object(rolling, "Client", side_effect=AssertionError):
+        for options, message in refusals:
+            with pytest.raises(ConfigError, match=message):
+                RollingBank(path, **options)
     with pytest.raises(FileError, match="nowhere"):
         RollingBank(tmp_path / "nowhere.safetensors")
     with pytest.raises(ConfigError, match="a conditional model"):
@@ -276,6 +287,8 @@ def test_invalid_options_and_requests_are_refused(
     for number in (-1, 2**63):
         with pytest.raises(ConfigError, match=f"scan {number}"):
             bank[number]
+    with pytest.raises(TypeError, match="scan 1.7; expected a whole number"):
+        bank[1.7]  # type: ignore[index]
     with pytest.raises(RuntimeError, match="should only be shared between processes"):
         pickle.dumps(bank)
 

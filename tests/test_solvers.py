@@ -184,7 +184,9 @@ def test_uniform_grids_are_evenly_spaced() -> None:
 
 
 def test_an_unknown_solver_and_zero_steps_are_refused() -> None:
-    with pytest.raises(ConfigError, match="solver 'rk4'; expected one of euler, heun"):
+    with pytest.raises(
+        ConfigError, match="solver 'rk4'; expected one of 'euler', 'heun'"
+    ):
         solve(gaussian_velocity, NOISE, (1.0, 0.0), "rk4")
     with pytest.raises(
         ConfigError, match="steps 0; expected a whole number, 1 or more"

@@ -29,7 +29,7 @@ from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, b
 from lidar_synth.generate.devices import refuse_worker, without_autocast
 from lidar_synth.generate.flow.guidance import guide
 from lidar_synth.generate.flow.path import Velocity
-from lidar_synth.generate.flow.solvers import mean_velocity, read_grid, solve
+from lidar_synth.generate.flow.solvers import SOLVERS, mean_velocity, read_grid, solve
 from lidar_synth.geometry import (
     SYNTHETIC,
     RangeImage,
@@ -350,6 +350,7 @@ class Generator:
         grid = self.header.grid(steps) if times is None else read_grid(times)
         if times is not None and steps is not None:
             raise ConfigError(f"steps {steps} and times {grid}", "one of the two")
+        choose("solver", solver, SOLVERS)
         if solver != "euler" and getattr(self.network, "ends", False):
             raise ConfigError(
                 f"solver {solver!r} for {self.name!r}",

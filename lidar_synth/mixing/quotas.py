@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import ConfigError, DataError, check_count
 from lidar_synth.geometry.arrays import Int64Array
 from lidar_synth.mixing.schedules import Schedule, Steps, constant_from, share_of
+from lidar_synth.noise import check_seed
 
 EpochSize = Literal["add", "replace"] | int
 """The length of all epochs: ``"add"`` uses every real scan once and adds synthetic ones to reach
@@ -96,8 +97,7 @@ class Mixture:
                 f"epoch_size={size!r}", "'add', 'replace' or a number of samples"
             )
         check_count("reuse", self.reuse, 1)
-        if not 0 <= self.seed < 2**64:
-            raise ConfigError(f"seed {self.seed}", "0 <= seed < 2^64")
+        check_seed(self.seed)
         for source in self.real + self.synthetic:
             if source.length == 0:
                 raise DataError(

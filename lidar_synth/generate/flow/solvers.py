@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lidar_synth.errors import ConfigError, check_count
+from lidar_synth.errors import ConfigError, check_count, choose
 from lidar_synth.generate.flow.path import Velocity, per_sample
 
 Grid = Sequence[float] | Tensor
@@ -119,8 +119,7 @@ def trajectory(
     Raises:
         ConfigError: on an unknown solver or a grid that does not descend within [0, 1].
     """
-    if solver not in SOLVERS:
-        raise ConfigError(f"solver {solver!r}", f"one of {', '.join(SOLVERS)}")
+    choose("solver", solver, SOLVERS)
     times = _times(grid, y)
     for t, t_next in pairwise(times):
         slope = SOLVERS[solver].slope(velocity, y, t, t_next, cond)

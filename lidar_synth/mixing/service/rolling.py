@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from inspect import signature
+from numbers import Real
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,9 +22,8 @@ from typing_extensions import Self
 
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import ConfigError, check_count, choose
-from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model, load_generator
-from lidar_synth.geometry import SYNTHETIC, Scan, model_provenance
+from lidar_synth.geometry import SYNTHETIC, Scan, index_of, model_provenance
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.mixing.service.client import Client
 from lidar_synth.mixing.service.ledger import COUNTERS, Starved
@@ -35,6 +35,7 @@ from lidar_synth.mixing.service.process import (
     GeneratorJob,
 )
 from lidar_synth.mixing.service.slots import Slots
+from lidar_synth.noise import check_seed
 
 # numbers in one message: fewer than fit into a socket's buffer, so that sending never blocks
 _PART = 8192
@@ -105,32 +106,31 @@ class RollingBank:
         **options: Any,
     ) -> None:
         _check(slots, seed, starved, refresh, timeout)
+        if threads is not None:
+            check_count("threads", threads, 1)
         for name in options:
             choose("option", name, signature(load_generator).parameters)
         path = find_model(model)
-        header, checksum = read_header(path)
-        if header.conditioning:
+        # Loaded here too, so that wrong options are refused before a process starts.
+        light = {"device": "cpu", "compile": False}
+        generator = load_generator(path, **options | light)
+        if generator.condition:
             raise ConfigError(
                 f"a rolling bank of {path}, a conditional model",
                 "an unconditional model",
             )
-        channels = set(header.channels) | (
-            {"confidence"} if "label" in header.channels else set()
-        )
+        sampling: dict[str, Any] = {"steps": steps, "solver": solver}
+        list(generator.samples(seed, [], **sampling))  # refuses wrong options
         replaced = max(1, round(refresh * slots)) if refresh else 0
-        columns = options.get("columns") or header.sensor.columns
-        self.sensor = replace(header.sensor, columns=columns)
-        width = "" if self.sensor == header.sensor else f":{columns} columns"
-        self.fields = frozenset(channels - {"range"} | {"reflectance"})
-        dtype = str(options.get("dtype", "torch.float32"))
-        precision = "" if dtype.endswith("float32") else f":{dtype}"
+        self.sensor = generator.sensor
+        self.fields = generator.fields | {"reflectance"}
         self.identity = (
-            f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:"
-            f"{starved}:{replaced}{width}{precision}"
+            f"rolling:{generator.hash}:{seed}:{steps or 'own'}:{solver}:"
+            f"{starved}:{replaced}{generator.variant}"
         )
         self._name = f"{path.stem}/{seed}"
-        self._provenance = model_provenance(path.stem, checksum, seed)
-        self._slots = Slots(Encoding(self.sensor, channels), slots + replaced)
+        self._provenance = model_provenance(path.stem, generator.hash, seed)
+        self._slots = Slots(Encoding(self.sensor, generator.fields), slots + replaced)
         job = GeneratorJob(
             path,
             seed,
@@ -138,7 +138,7 @@ class RollingBank:
             replaced,
             threads,
             options,
-            {"steps": steps, "solver": solver},
+            sampling,
         )
         self._client = Client(job, self._slots, timeout)
 
@@ -151,7 +151,8 @@ class RollingBank:
         """The scan; its ``id`` says which one it is, also with ``starved`` and ``refresh``.
 
         Raises:
-            ConfigError: on an invalid number, or a closed bank.
+            ConfigError: on a number out of range, or a closed bank.
+            TypeError: on anything but a whole number.
             ProcessError: if the generator process died, or made no scan within ``timeout`` seconds.
             DataError: if the scan's bytes in shared memory are not those that were written.
         """
@@ -168,7 +169,7 @@ class RollingBank:
         ``bank[number]``."""
         if not 0 <= number < 2**63:
             raise ConfigError(f"scan {number}", "0 <= number < 2^63")
-        slot, served, checksum = self._client.ask(GET, int(number))
+        slot, served, checksum = self._client.ask(GET, index_of(number, 2**63))
         try:
             return served, self._slots.read(slot, served, checksum)
         finally:
@@ -212,10 +213,9 @@ def _check(
     slots: int, seed: int, starved: str, refresh: float | None, timeout: float
 ) -> None:
     check_count("slots", slots, 1)
-    if timeout <= 0:
-        raise ConfigError(f"timeout={timeout}", "more than 0 seconds")
-    if not 0 <= seed < 2**64:
-        raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
+    if not (isinstance(timeout, Real) and timeout > 0):
+        raise ConfigError(f"timeout={timeout!r}", "more than 0 seconds")
+    check_seed(seed)
     if starved not in get_args(Starved):
         raise ConfigError(f"starved={starved!r}", f"one of {get_args(Starved)}")
     if refresh is not None and not 0 < refresh <= 1:
