@@ -16,7 +16,9 @@ from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.as_sensor import make_transfer
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.mixing import Linear, MixedScans
+from lidar_synth.mixing import Linear, MixedScans, MixedStream
+from lidar_synth.mixing.batches import MixedBatches
+from lidar_synth.mixing.service import BatchMixer
 from lidar_synth.mixing.state import make_state
 
 THEIRS = Sensor("theirs", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
@@ -197,6 +199,12 @@ def test_bad_sizes_are_refused() -> None:
             mixture().loader(batch_size=wrong)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="epoch_size=4.5; expected 'add', 'replace'"):
         MixedScans(Scans("r", 4), Endless(), 0.5, epoch_size=4.5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("batched", [BatchMixer, MixedStream, MixedBatches])
+def test_batches_of_no_mixture_are_refused(batched: Any) -> None:
+    with pytest.raises(ConfigError, match="batches of a list; expected a MixedScans"):
+        batched([1, 2], batch_size=2)
 
 
 def test_sizes_of_numpy_are_taken() -> None:

@@ -101,6 +101,18 @@ def resume_epoch(dataset: Any, epoch: int, position: int) -> None:
         dataset.set_epoch(epoch)
 
 
+def check_mixture(dataset: Any, hint: str = "mix(real, synthetic) makes one.") -> None:
+    """Check that a dataset is a mixture.
+
+    Raises:
+        ConfigError: on any other, with the hint.
+    """
+    if not hasattr(dataset, "mixture"):
+        raise ConfigError(
+            f"batches of a {type(dataset).__name__}", "a MixedScans", hint
+        )
+
+
 class MixedBatches(Divided, Sampler[list[int]]):
     """A batch sampler in the order of the plan, for one rank or several, that can resume from any
     step.
@@ -134,10 +146,7 @@ class MixedBatches(Divided, Sampler[list[int]]):
         drop_last: bool = False,
     ) -> None:
         check_count("batch_size", batch_size, 1)
-        if not hasattr(dataset, "mixture"):
-            raise ConfigError(
-                f"batches of a {type(dataset).__name__}", "a MixedScans", DIVIDED
-            )
+        check_mixture(dataset, DIVIDED)
         self.dataset = dataset
         self.batch_size = batch_size
         self.drop_last = drop_last

@@ -12,6 +12,7 @@ from lidar_synth.errors import ConfigError, check_count
 from lidar_synth.mixing.batches import (
     AHEAD,
     CutSteps,
+    check_mixture,
     cut_steps,
     rank_share,
     resume_epoch,
@@ -52,8 +53,8 @@ class MixedStream(Divided, IterableDataset[Any]):
             they must be known before workers start.
 
     Raises:
-        ConfigError: on a batch size below 1 or a rank out of range; on iterating with default ranks
-            where an ``Accelerator`` is set up for several processes.
+        ConfigError: on another dataset, a batch size below 1 or a rank out of range; on iterating
+            with default ranks where an ``Accelerator`` is set up for several processes.
 
     Example:
         >>> from torch.utils.data import DataLoader
@@ -78,6 +79,7 @@ class MixedStream(Divided, IterableDataset[Any]):
         rank: int | None = None,
         world_size: int | None = None,
     ) -> None:
+        check_mixture(scans)
         check_count("batch_size", batch_size, 1)
         self.scans = scans
         self.batch_size = int(batch_size)

@@ -19,6 +19,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry import Scan
 from lidar_synth.mixing import MixedScans
+from lidar_synth.mixing.batches import check_mixture
 
 
 class Place(NamedTuple):
@@ -50,7 +51,7 @@ class BatchMixer:
 
     Raises:
         ConfigError: if both or neither of ``batch_size`` and ``batch_sampler`` are given, or on a
-            batch size below 1.
+            batch size below 1, or another dataset.
 
     Example:
         >>> from lidar_synth import BatchMixer, MixedScans, load_generator, open_scans
@@ -69,6 +70,7 @@ class BatchMixer:
         batch_sampler: Sampler[list[int]] | None = None,
         **options: Any,
     ) -> None:
+        check_mixture(dataset)
         if (batch_size is None) == (batch_sampler is None):
             raise ConfigError(
                 f"batch_size={batch_size} and batch_sampler={batch_sampler}",
