@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry import Source
+from lidar_synth.geometry import Source, check_source
 from lidar_synth.lab.evaluate.cache import extract_all
 from lidar_synth.lab.evaluate.features import Extractor, find_weights, load_published
 from lidar_synth.lab.evaluate.leakage import refuse_training_data
@@ -56,8 +56,9 @@ def evaluate(
         left_out: filled with {measure: why it was left out}.
 
     Raises:
-        ConfigError: on an unknown protocol, several processes without a cache, or real scans
-            that the model has seen; see ``leakage.refuse_training_data``.
+        ConfigError: on a path, which ``open_scans`` opens, an unknown protocol, several processes
+            without a cache, or real scans that the model has seen; see
+            ``leakage.refuse_training_data``.
         DataError: on an empty set, a scan without returns in the protocol's area, or, without
             ``anyway``, fewer scans than the paper's or sensors that differ.
 
@@ -67,6 +68,8 @@ def evaluate(
         >>> [score.metric for score in scores]
         ['BEV Jensen-Shannon distance', 'BEV maximum mean discrepancy']
     """
+    for scans in (real, generated):
+        check_source(scans)
     rules = find_protocol(protocol)
     if not anyway:
         check_counts(rules, len(real), len(generated))

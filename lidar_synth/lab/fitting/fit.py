@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry import Scan, Sensor, Source, spread
+from lidar_synth.geometry import Scan, Sensor, Source, check_source, spread
 from lidar_synth.geometry.arrays import Float64Array, Int64Array
 from lidar_synth.geometry.lines import nearest_beams, residuals
 from lidar_synth.lab.fitting.azimuths import Azimuths, fit_azimuths, turn_of
@@ -117,6 +117,7 @@ def fit_sensor(
             otherwise the next lower power of two.
 
     Raises:
+        ConfigError: on a path, which ``open_scans`` opens, or another that is no ``Source``.
         DataError: without points, with one beam only, or if the points do not lie on beams, such as
             with a frame that is too far from the sensor's.
 
@@ -126,6 +127,7 @@ def fit_sensor(
         >>> fit.sensor.shape, fit.sensor.elevations[:2], round(fit.share, 3)
         ((128, 1024), (22.3242, 21.9727), 1.0)
     """
+    check_source(scans)
     given = [scans[i] for i in spread(range(len(scans)), SCANS)]
     returned = [np.asarray(scan.points.any(axis=1)) for scan in given]
     scans = [scan[there] for scan, there in zip(given, returned, strict=True)]

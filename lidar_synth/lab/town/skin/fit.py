@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry import Scan, Sensor, Source, load_sensor
+from lidar_synth.geometry import Scan, Sensor, Source, check_source, load_sensor
 from lidar_synth.lab.town.returns import LEVELS, ReturnNoise
 from lidar_synth.lab.town.skin.domains import Domain, returns_of
 from lidar_synth.lab.town.skin.estimate import estimate_skin
@@ -54,7 +54,7 @@ def fit_skin(
         progress: whether to show progress bars.
 
     Raises:
-        ConfigError: on an unknown sensor.
+        ConfigError: on an unknown sensor, or a path, which ``open_scans`` opens.
         DataError: on fewer than 5 scans, on scans of another sensor, not in ring order, or without
             reflectance; on range images with fewer columns than the sensor fires.
 
@@ -65,6 +65,7 @@ def fit_skin(
         >>> skin.provenance["scans"], skin.sensor.name
         (6, 'town')
     """
+    check_source(scans)
     if len(scans) < FEWEST_SCANS:
         raise DataError(
             f"{len(scans)} scans",
