@@ -456,11 +456,6 @@ BAD = {
         "places by 'street'; expected one of auto, drive",
     ),
     "no number of stretches": (drives(), {"places": "drive:2"}, "places by 'drive:2'"),
-    "no labelled scan": (
-        drives(),
-        {"labelled": 0},
-        "labelled 0; expected a whole number, 1 or more",
-    ),
     "more labelled than there are": (
         drives(),
         {"labelled": 9},
@@ -481,12 +476,6 @@ BAD = {
         {"classes": "waymo"},
         "classes 'waymo'; expected one of",
     ),
-    "an unknown arm": (
-        drives(),
-        {"arms": ("real", "magic")},
-        "arm 'magic'; expected one of 'real",
-    ),
-    "a share of everything": (drives(), {"ratios": (1.0,)}, "ratio 1.0"),
     "no labels": (scans_with(label=None, raw_label=None), {}, "without labels"),
     "labels of another table": (
         scans_with(label=np.full(len(drives()[5]), 41, np.uint8), raw_label=None),

@@ -1,14 +1,16 @@
-"""The summary of ``prove``: places without the scored classes, and the arm that is chosen on the
-other places."""
+"""The settings of ``prove``, and its summary: places without the scored classes, and the arm that
+is chosen on the other places."""
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.datasets.recordings import Recordings
+from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.proof.arms import Row, rows
 from lidar_synth.lab.proof.page import body
@@ -23,6 +25,25 @@ PERSON = TRAIN_ID["person"]
 ROAD = TRAIN_ID["road"]
 FOUND = {"real": 300, "exchange": 320, "town": 200, "pretrain": 600, "alone": 100}
 """Persons of 1,000 that each arm finds."""
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("labelled", 0, "labelled 0; expected a whole number, 1 or more"),
+        ("widths", (), "number of widths 0; expected a whole number, 2 or more"),
+        ("widths", (4, 8.0), "width 8.0; expected a whole number, 1 or more"),
+        ("seed", -1, "seed -1; expected a whole number, 0 or more"),
+        ("arms", ("real", "magic"), "arm 'magic'; expected one of 'real"),
+        ("ratios", (1.0,), r"ratios \(1\.0,\); expected shares"),
+        ("ratios", (), r"ratios \(\); expected shares"),
+    ],
+)
+def test_wrong_settings_are_refused_at_once(
+    name: str, value: Any, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ProofSettings(**{name: value})
 
 
 def outcome(found: int, persons: int) -> TrialOutcome:

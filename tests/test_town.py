@@ -104,8 +104,8 @@ def test_a_town_is_an_indexable_source() -> None:
     "options",
     [
         {"seed": -1},
-        {"scans": -1},
         {"scans": 2.5},
+        {"scans": "many"},
         {"interval": 0.0},
         {"sensor": "hdl65"},
     ],

@@ -175,19 +175,19 @@ def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
     """The rows of a comparison; ``BASE`` is always the first.
 
     Raises:
-        ConfigError: on an unknown arm, or a share that is not between 0 and 1.
+        ConfigError: on an unknown arm, no shares, or one that is not between 0 and 1.
     """
     for name in names:
         choose("arm", name, ARMS)
-    if wrong := [ratio for ratio in ratios if not 0 < ratio < 1]:
+    if not (ratios and all(0 < ratio < 1 for ratio in ratios)):
         raise ConfigError(
-            f"ratio {wrong[0]}",
+            f"ratios {ratios}",
             "shares of synthetic scans between 0 and 1, such as 0.5",
         )
-    ordered = [name for name in ARMS if name in {BASE, *names}]
     return [
         Row(name, r)
-        for name in ordered
+        for name in ARMS
+        if name in {BASE, *names}
         for r in (sorted(set(ratios)) if ARMS[name].ratio is None else (None,))
     ]
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from lidar_synth.errors import check_count
+from lidar_synth.lab.proof.arms import rows
 
 MOST_LABELLED = 200
 """Labelled scans that are trained on if no number is given."""
@@ -26,7 +27,7 @@ class ProofSettings:
         model: of the arms with a generator: a name or a path.
         columns: of the grid that the reference network sees; None keeps scans as they are, for your
             own trainer.
-        widths: channels of the reference network by level.
+        widths: channels of the reference network by level, two or more.
         classes: how classes are pooled: a name of ``GROUPS``; "auto" takes that of the dataset's
             layout.
         beams: number of the sensor's beams, evenly spaced, that all scans keep, to compare on a
@@ -35,7 +36,7 @@ class ProofSettings:
         seed: of the choice of labelled scans and of the order of places.
 
     Raises:
-        ConfigError: on values with which nothing can be trained.
+        ConfigError: on values with which nothing can be trained, such as an unknown arm.
 
     Example:
         >>> from lidar_synth import ProofSettings
@@ -66,5 +67,10 @@ class ProofSettings:
         for name in ("batch", "seeds", "tested", "synthetic"):
             check_count(name, getattr(self, name), 1)
         check_count("iterations", self.iterations, 10)
+        check_count("number of widths", len(self.widths), 2)
+        for width in self.widths:
+            check_count("width", width, 1)
+        check_count("seed", self.seed, 0)
+        rows(self.arms, self.ratios)
         if self.labelled is not None:
             check_count("labelled", self.labelled, 1)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, check_count
 from lidar_synth.files.parsing import json_checksum
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.geometry import SYNTHETIC, Scan, Sensor, index_of, load_sensor
@@ -94,12 +94,10 @@ class Town:
         motion: bool = True,
         skin: str | Path | Skin | None = None,
     ) -> None:
-        whole = int(seed) == seed >= 0 and int(scans) == scans >= 0
-        if not whole or not 0 < interval < 60:
-            raise ConfigError(
-                f"a town with seed {seed}, {scans} scans and an interval of {interval} s",
-                "seed >= 0, scans >= 0 and 0 < interval < 60 s",
-            )
+        check_count("seed", seed, 0)
+        check_count("scans", scans, 0)
+        if not 0 < interval < 60:
+            raise ConfigError(f"interval {interval}", "0 < interval < 60 s")
         self.seed = int(seed)
         self.sensor = load_sensor(sensor)
         self.interval = interval
