@@ -218,6 +218,17 @@ def test_a_reference_replaces_the_mean_histograms(tmp_path: Path) -> None:
         score(bank, [], name="odd")
 
 
+def test_every_scan_counts_alike_in_the_mean(tmp_path: Path) -> None:
+    """Of one scan and a copy with half of its returns at other ranges, both are as far away."""
+    images = [plain_image(0), plain_image(0)]
+    images[0].range[:] = 10
+    images[1].range[:] = 60
+    images[1].range[::2] = 0
+    write_bank(tmp_path, images, fields=())
+    near, far = score(Bank(tmp_path), progress=False).values["range"]
+    assert near == pytest.approx(far)
+
+
 def test_scores_do_not_depend_on_processes_and_are_saved(tmp_path: Path) -> None:
     write_bank(tmp_path, images_with("empty"), shard_size=8, fields=ALL)
     one, two = (score(Bank(tmp_path), jobs=jobs, progress=False) for jobs in (1, 2))

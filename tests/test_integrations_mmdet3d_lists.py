@@ -21,7 +21,12 @@ from lidar_synth.integrations.mmdet3d_slots import (
     open_folder,
     read_url,
 )
-from lidar_synth.integrations.nuscenes import CLASSES, as_nuscenes, five_values
+from lidar_synth.integrations.nuscenes import (
+    CLASSES,
+    as_nuscenes,
+    five_values,
+    turned_points,
+)
 from streets import held, kitti, semantic_kitti, street, synthetic
 
 from lidar_synth.errors import ConfigError, DataError, FileError
@@ -153,6 +158,11 @@ def test_scans_in_nuscenes_form(tmp_path: Path) -> None:
         np.abs(held(turned.boxes, turned.points) - held(scan.boxes, scan.points)).max()
         <= 3
     )
+    yaw = scan.boxes.values[:, 6]
+    ahead = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], 1)
+    turn = turned.boxes.values[:, 6]
+    found = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
+    assert np.allclose(found, turned_points(ahead), atol=1e-6)
 
 
 def test_names_of_boxes_become_nuscenes_classes() -> None:

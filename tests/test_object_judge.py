@@ -89,6 +89,12 @@ def test_surfaces_of_a_crop_are_told_apart(case: str, turn: float) -> None:
     assert rough == pytest.approx(0.03, abs=0.01)
 
 
+def test_heights_of_a_crop_are_above_its_ground() -> None:
+    rng = np.random.default_rng(0)
+    points = np.stack([*rng.uniform(9, 11, (2, 200)), np.full(200, -0.2)], 1)
+    assert crop(made(points), "").features["height"][-3:] == pytest.approx(1.5)
+
+
 def seen(distance: float, width: float, name: str) -> Crop:
     return Crop(name, distance, width, 20, 0, 0, 0, {})
 
@@ -120,6 +126,16 @@ def test_a_place_that_is_asked_about_is_never_seen() -> None:
     even = [(marked(f"p{i}", 1), marked("", -1)) for i in range(4) for _ in range(20)]
     assert separate(even, ["mark"]) == 1
     assert separate(even[:20], ["mark"]) is None  # one place
+
+
+def test_the_place_of_second_objects_is_never_seen_either() -> None:
+    """Their mark has one sign at c and the other at d, which only a classifier that has seen both
+    can use."""
+    a, b, c, d = (
+        replace(seen(10, 2, place), features={"mark": np.array([float(value)])})
+        for place, value in zip("abcd", (0, 0, 1, -1), strict=True)
+    )
+    assert separate([(a, c), (a, d), (b, c), (b, d)] * 5, ["mark"]) == 0
 
 
 def test_cars_alike_cannot_be_told_and_rough_ones_can(sets: dict[str, Path]) -> None:

@@ -354,6 +354,25 @@ def test_movers_do_not_collide() -> None:
         assert not (overlap & ~np.eye(len(s), dtype=bool)).any()
 
 
+@pytest.mark.parametrize("stretch", range(4))
+def test_traffic_keeps_to_the_right(stretch: int) -> None:
+    """To the left of a driver, the middle of the street is at t = 0, of a side street at its s."""
+    world = build_world(0, stretch, 0.4)
+    drivers = [
+        m for m in world.movers if m.shapes[0].name not in ("Pedestrian", "Tram")
+    ]
+    assert {m.line.along for m in drivers} == {True, False}
+    for _, at, _, direction, _ in (m.line for m in drivers if m.line.along):
+        assert at * direction < 0
+    for _, at, _, direction, _ in (m.line for m in drivers if not m.line.along):
+        middle = min((c.s for c in world.street.crossings), key=lambda s: abs(at - s))
+        assert (at - middle) * direction > 0
+    if world.street.turn:
+        crossing, side = world.street.turn
+        at, *_ = ego_place(world.street, 100.0)
+        assert (at - crossing.s) * side == pytest.approx(crossing.half / 2)
+
+
 @pytest.mark.parametrize("stretch", [1, 7])
 def test_nothing_moves_or_stands_in_a_parked_vehicle(stretch: int) -> None:
     """In stretch 1 bicycles are parked in rows, in stretch 7 cars on a side street with traffic."""

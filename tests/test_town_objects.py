@@ -156,6 +156,10 @@ def test_sizes_fit_those_of_a_dataset(bank: TownObjects) -> None:
     found = fitted[largest(fitted)]
     local = found.scan.boxes.contain(found.scan.points)[0]  # type: ignore[union-attr]
     assert local.mean() > 0.9
+    own = bank.boxes.values[np.array(bank.boxes.names) == "Car"]
+    assert np.ptp(fitted.boxes.values[cars, 3:6] / own[:, 3:6], 0).max() < 1e-5
+    floors = (v[:, 2] - v[:, 5] / 2 for v in (own, fitted.boxes.values[cars]))
+    assert next(floors) == pytest.approx(next(floors), abs=1e-5)
     vans = np.array(bank.boxes.names) == "Van"
     kept = np.array(fitted.boxes.names) == "Van"
     assert fitted.boxes.values[kept].tolist() == bank.boxes.values[vans].tolist()
