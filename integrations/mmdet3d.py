@@ -31,6 +31,7 @@ from lidar_synth.integrations.mmdet3d_slots import (
     open_folder,
     read_url,
     scan_of,
+    weight_of,
 )
 from lidar_synth.integrations.weights import KEY, weigh_mmdet3d
 from numpy.typing import NDArray
@@ -230,11 +231,6 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
         )
         return ((epoch, index) for index in islice(order, start, None))
 
-    def weights_of(self, paths: list[str]) -> list[float]:
-        """The weight in the loss of samples by the paths of their points, in this epoch."""
-        synthetic = float(self.folders[0].mixed.synthetic_weight(self.epoch))
-        return [synthetic if path.startswith(PREFIX) else 1.0 for path in paths]
-
     def _planned(self, entries: NDArray[np.int64]) -> Iterator[int]:
         """This process's entries; the first ones again where all processes need as many."""
         whole = np.resize(entries, self.total_size)
@@ -284,7 +280,7 @@ class SynthEpochHook(Hook):  # type: ignore[misc]
             )
         sampler = runner.train_dataloader.sampler
         if any(KEY in folder.settings for folder in sampler.folders):
-            weigh_mmdet3d(runner.model, sampler.weights_of)
+            weigh_mmdet3d(runner.model, lambda path: weight_of(path, sampler.epoch))
         self._resumes = True
 
     def before_train_epoch(self, runner: Any) -> None:

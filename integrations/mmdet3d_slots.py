@@ -241,8 +241,7 @@ def read_url(url: str) -> bytes:
         DataError: on any other URL, or on labels of a scan without labels.
         FileError: if there is no such list.
     """
-    source, number, kind = split_url(url)
-    folder = open_folder(Path(source))
+    folder, number, kind = split_url(url)
     scan = folder.scan(number)
     if kind == "bin":
         return folder.layout.points(scan).astype("<f4").tobytes()
@@ -250,12 +249,8 @@ def read_url(url: str) -> bytes:
     return encode_labels(scan, SEMANTIC_KITTI).astype("<u4").tobytes()
 
 
-def split_url(url: str) -> tuple[str, int, str]:
-    """Source, number and ending (``bin`` or ``label``) of a URL.
-
-    Raises:
-        DataError: on any other URL.
-    """
+def split_url(url: str) -> tuple[SlotFolder, int, str]:
+    """Folder, number and ending (``bin`` or ``label``) of a URL; raises as ``read_url``."""
     source, _, name = url.removeprefix(PREFIX).rpartition("/")
     number, _, kind = name.partition(".")
     if not (
@@ -265,7 +260,7 @@ def split_url(url: str) -> tuple[str, int, str]:
         and kind in ("bin", "label")
     ):
         raise DataError(f"{url!r}", f"{PREFIX}<folder>/<number>.bin or .label")
-    return source, int(number), kind
+    return open_folder(Path(source)), int(number), kind
 
 
 def is_mixed(folder: Path) -> bool:
@@ -275,8 +270,16 @@ def is_mixed(folder: Path) -> bool:
 
 def scan_of(url: str) -> Scan:
     """The scan that a URL names."""
-    source, number, _ = split_url(url)
-    return open_folder(Path(source)).scan(number)
+    folder, number, _ = split_url(url)
+    return folder.scan(number)
+
+
+def weight_of(path: str, epoch: int) -> float:
+    """The weight in the loss of a sample in an epoch by the path of its points: that of its list,
+    or 1 of a real one."""
+    if not path.startswith(PREFIX):
+        return 1.0
+    return float(split_url(path)[0].mixed.synthetic_weight(epoch))
 
 
 def _arrays(camera: dict[str, Any]) -> dict[str, Any]:

@@ -70,12 +70,12 @@ def weigh_openpcdet(model: Any) -> None:
     model.register_forward_pre_hook(take_weights)
 
 
-def weigh_mmdet3d(model: Any, weights_of: Callable[[list[str]], list[float]]) -> None:
+def weigh_mmdet3d(model: Any, weight_of: Callable[[str], float]) -> None:
     """Make a model of MMDetection3D multiply the weights of the anchors of each sample.
 
     Args:
         model: its detector.
-        weights_of: the weights of the samples with some paths of their points (``lidar_path``).
+        weight_of: the weight of a sample by the path of its points (``lidar_path``).
 
     Raises:
         ConfigError: on a model with another head than one of anchors, or with a second stage.
@@ -90,7 +90,7 @@ def weigh_mmdet3d(model: Any, weights_of: Callable[[list[str]], list[float]]) ->
         anchors: Any, boxes: Any, metas: Any, *args: Any, **options: Any
     ) -> Any:
         targets = list(make_targets(anchors, boxes, metas, *args, **options))
-        weights = torch.tensor(weights_of([meta["lidar_path"] for meta in metas]))
+        weights = torch.tensor([weight_of(meta["lidar_path"]) for meta in metas])
         for place in (1, 3, 5):  # the weights of labels, boxes and directions, by level
             targets[place] = [
                 part * weights.view(-1, *[1] * (part.dim() - 1)).to(part)

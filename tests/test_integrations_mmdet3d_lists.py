@@ -20,6 +20,7 @@ from lidar_synth.integrations.mmdet3d_slots import (
     draw_in_epoch,
     open_folder,
     read_url,
+    weight_of,
 )
 from lidar_synth.integrations.nuscenes import (
     CLASSES,
@@ -454,6 +455,21 @@ def test_a_list_holds_schedules_and_lengths(
             MIX | {"synthetic": scans, "ratio": min},
             data_root=tmp_path / "sk",
         )
+
+
+def test_each_list_has_a_loss_weight_of_its_own(scans: Path, tmp_path: Path) -> None:
+    """Several may be joined in one dataset."""
+    real = semantic_kitti_list(
+        semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json"
+    )
+    found = []
+    for name, weight in (("a", 0.5), ("b", {0: 0.2, 3: 0.1})):
+        settings = MIX | {"synthetic": scans, "loss_weight": weight}
+        path = write_infos(tmp_path / name, real, settings, data_root=tmp_path / "sk")
+        entries = json.loads(path.read_text())["data_list"]
+        paths = [entries[i]["lidar_points"]["lidar_path"] for i in (0, -1)]
+        found += [[weight_of(path, epoch) for epoch in (0, 3)] for path in paths]
+    assert found == [[1, 1], [0.5, 0.5], [1, 1], [0.2, 0.1]]
 
 
 def test_lists_of_another_format_are_refused(scans: Path, tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def test_a_model_that_cannot_weigh_is_refused() -> None:
     with pytest.raises(ConfigError, match="synthetic_first"):
         weigh_openpcdet(centers)
     with pytest.raises(ConfigError, match="loss_weight"):
-        weigh_mmdet3d(SimpleNamespace(bbox_head=SimpleNamespace()), lambda paths: [])
+        weigh_mmdet3d(SimpleNamespace(bbox_head=SimpleNamespace()), float)
 
 
 def test_anchors_of_a_sample_are_weighed_in_mmdetection3d() -> None:
@@ -83,9 +83,7 @@ def test_anchors_of_a_sample_are_weighed_in_mmdetection3d() -> None:
 
     head = SimpleNamespace(anchor_target_3d=targets)
     weights = {"real.bin": 1.0, "lsynth://a/0.bin": 0.1}
-    weigh_mmdet3d(
-        SimpleNamespace(bbox_head=head), lambda paths: [weights[p] for p in paths]
-    )
+    weigh_mmdet3d(SimpleNamespace(bbox_head=head), weights.__getitem__)
     metas = [{"lidar_path": path} for path in weights]
     found = head.anchor_target_3d(None, None, metas, sampling=True)
     expected = torch.tensor([1.0, 0.1])
