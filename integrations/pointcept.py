@@ -34,6 +34,7 @@ from lidar_synth.integrations.mixture import (
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.geometry import Scan
+from lidar_synth.mixing.epochs import Position
 
 try:
     from pointcept.datasets.builder import DATASETS
@@ -92,7 +93,7 @@ class MixedSemanticKITTI(MixedEpoch, SemanticKITTIDataset):  # type: ignore[misc
 
     def domain(self, index: int) -> int:
         """0 if the sample at ``index`` is real in this epoch, 1 if it is synthetic."""
-        return int(self.mixed.domain(index % len(self.mixed)))
+        return int(self.mixed.domain(self._place(index)))
 
     def __len__(self) -> int:
         return int(len(self.mixed) * self.loop)
@@ -100,8 +101,13 @@ class MixedSemanticKITTI(MixedEpoch, SemanticKITTIDataset):  # type: ignore[misc
     def get_data(self, idx: int) -> dict[str, Any]:
         """Coordinates (N, 3), strength (N, 1) float32, segment (N,) int32 and a name, as Pointcept
         reads them."""
-        data: dict[str, Any] = self._take(idx % len(self.mixed), super().get_data)
+        data: dict[str, Any] = self._take(self._place(idx), super().get_data)
         return data
+
+    def _place(self, index: int) -> int:
+        """The position of an index; each pass of Pointcept's ``loop`` has an epoch of its own."""
+        later, position = divmod(index, len(self.mixed))
+        return Position(position, self.mixed.epoch + later) if later else position
 
     def _synthetic(self, scan: Scan) -> dict[str, Any]:
         points = points_of(scan)
@@ -142,7 +148,7 @@ class EpochOf:
 
     def __iter__(self) -> Iterator[Any]:
         for each in mixtures(self._loader):
-            each.set_epoch(self._trainer.epoch)
+            each.set_epoch(self._trainer.epoch * each.loop)
         return iter(self._loader)
 
     def __len__(self) -> int:

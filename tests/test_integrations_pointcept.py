@@ -136,6 +136,24 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
     assert not seen[0] & seen[1]
 
 
+def test_each_pass_of_a_loop_is_an_epoch_of_the_mixture(made: Path) -> None:
+    """Trap: with ``epoch=6, eval_epoch=2`` Pointcept's own loop counts two epochs, each of three
+    passes."""
+    ratios = [1.0, 0.4, 0.4, 0.0, 0.4, 0.0]
+    mixture = {"synthetic": str(made / "synthetic"), "ratio": ratios, "epoch_size": 5}
+    dataset = build(made, stock=False, loop=3, mixture=mixture)
+    loader = DataLoader(
+        dataset, 5, num_workers=1, persistent_workers=True, collate_fn=list
+    )
+    trainer = SimpleNamespace(epoch=0)
+    shares = []
+    for trainer.epoch in (0, 1):
+        for batch in adapter.EpochOf(loader, trainer):
+            shares.append(sum(s["name"].startswith("synthetic_") for s in batch) / 5)
+    assert shares == ratios
+    assert sum(map(dataset.domain, range(15))) == 2
+
+
 def test_a_process_for_another_gpu_registers_the_dataset() -> None:
     """Trap: Pointcept runs ``custom_imports`` where it reads the configuration's file, and sends
     other processes the configuration as a pickle."""
