@@ -12,8 +12,8 @@
 ``accelerator.prepare(loader)`` would count the passes itself, from 0, whatever epoch was set or
 resumed, and repeat samples until all batches are full (``even_batches``). Here a pass is through
 the epoch that was set or resumed, or else the next one, and all processes together load each of its
-samples once. Resume by ``load_state_dict``, not by ``accelerator.skip_first_batches``, of whose
-batches the prepared loader does not know.
+samples once. Resume by ``load_state_dict``; ``state_dict`` does not know of the batches that
+``skip_first_batches`` leaves out, with which Hugging Face's Trainer resumes.
 """
 
 from collections.abc import Iterator, Mapping
@@ -73,6 +73,8 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
             "Give the loader as it was before accelerator.prepare.",
         )
     divided.divide(accelerator.process_index, accelerator.num_processes)
+    if isinstance(divided, MixedBatches):
+        vars(divided).update(sampler=_KeepEpoch())
     prepared = prepare_data_loader(
         loader,
         accelerator.device,
@@ -86,6 +88,14 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
         state_dict=shard.state_dict, load_state_dict=shard.load_state_dict
     )
     return shard
+
+
+class _KeepEpoch:
+    """A batch sampler's sampler, whose epoch Accelerate sets instead of the dataset's where batches
+    are skipped: its earlier releases count from 0 there."""
+
+    def set_epoch(self, epoch: int) -> None:
+        """Leave the mixture in the epoch that was set or resumed."""
 
 
 class _Prepared(DataLoaderShard):  # type: ignore[misc]

@@ -202,6 +202,20 @@ def test_a_prepared_loader_resumes_after_its_last_batch(
     assert loader.state_dict()["position"] == 4
 
 
+def test_batches_are_skipped_in_the_epoch_that_was_set() -> None:
+    """So resumes Hugging Face's Trainer."""
+    from accelerate import Accelerator, skip_first_batches
+
+    train = mixed()
+    loader = prepare(Accelerator(cpu=True), batched(train, 0))
+    loader.set_epoch(6)
+    rest = skip_first_batches(loader, 5)
+    rest.iteration = 0  # trap: as in Accelerate 1.10
+    assert [int(x) for batch in rest for x in batch] == planned(6, 20)
+    loader.set_epoch(7)
+    assert [int(x) for batch in loader for x in batch] == planned(7)
+
+
 def test_an_epoch_that_is_set_after_a_used_one_is_unused() -> None:
     from accelerate import Accelerator
 
