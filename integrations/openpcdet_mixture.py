@@ -27,13 +27,14 @@ class MixedDetection(MixedEpoch):
     ``_synthetic``.
 
     OpenPCDet replaces a scan without boxes after augmentation by another random scan. To keep the
-    ratio, a real scan is replaced by a real one here, and a synthetic one raises an error:
-    ``labels: paste`` gives synthetic scans boxes.
+    ratio, a real scan is replaced by a real one here, and a synthetic one by a synthetic one; where
+    many in a row have none, an error names ``labels: paste``, which gives them boxes.
     """
 
     known: Collection[str] = ()
     """The class names that a box of a synthetic scan may have."""
     _current: int | None = None  # the position whose sample is being made
+    _replaced = 0  # number of synthetic scans without boxes that it replaced
     weighed = False
     """Whether samples have a weight in the loss."""
     dataset_cfg: Any
@@ -89,20 +90,27 @@ class MixedDetection(MixedEpoch):
             return sample
         finally:
             self._current = None
+            self._replaced = 0
 
     def _replacement(self, index: int) -> Any:
         """The sample with which ``prepare_data`` replaces a scan without boxes after
-        augmentation."""
+        augmentation: for a synthetic one the next synthetic one of the epoch."""
         assert self._current is not None
         if not self.mixed.domain(self._current):
             return super().__getitem__(index)  # type: ignore[misc]
         scan = self.mixed[self._current]
-        raise DataError(
-            f"synthetic scan {scan.id!r} has no box of {list(self.class_names)} in range after "
-            "augmentation",
-            "at least one, because OpenPCDet would replace the scan by another one",
-            "Use labels: paste with a bank of objects, and gt_sampling.",
-        )
+        if self._replaced == LOOKED_AT:
+            raise DataError(
+                f"synthetic scan {scan.id!r} has no box of {list(self.class_names)} in range after "
+                f"augmentation, nor have the {LOOKED_AT} before it",
+                "at least one, because OpenPCDet replaces such a scan by another one",
+                "Use labels: paste with a bank of objects, and gt_sampling.",
+            )
+        self._replaced += 1
+        others = np.flatnonzero(self.mixed.plan().domain)
+        later = np.searchsorted(others, self._current, side="right")
+        self._current = int(others[later % len(others)])
+        return self._take(self._current, super().__getitem__)  # type: ignore[misc]
 
     def _check_boxes(self) -> None:
         """Check that the first synthetic scans have boxes of known classes, and one that is

@@ -233,6 +233,26 @@ def no_boxes(data_dict: Any) -> Any:
     return data_dict | {"gt_boxes": data_dict["gt_boxes"][:0]}
 
 
+def test_a_synthetic_scan_without_boxes_is_replaced_by_the_next_one(made: Path) -> None:
+    """As when gt_sampling ends before the last epochs: a night's training goes on."""
+    dataset = build(made, sampling=False)
+    synthetic_ones = [i for i in range(len(dataset)) if dataset.domain(i)]
+    names = [dataset[i]["frame_id"] for i in synthetic_ones]
+    empty = dataset.mixed[synthetic_ones[-2]].id
+    make = dataset._synthetic
+
+    def without_boxes(scan: Any) -> Any:
+        none = Boxes(np.zeros((0, 7), np.float32), ())
+        return make(replace(scan, boxes=none) if scan.id == empty else scan)
+
+    dataset._synthetic = without_boxes
+    assert [dataset[i]["frame_id"] for i in synthetic_ones] == [
+        *names[:-2],
+        names[-1],
+        names[-1],
+    ]
+
+
 def test_real_scans_without_boxes_are_replaced_by_real_ones(made: Path) -> None:
     dataset = build(made, sampling=False)
     inner = dataset.kitti_infos[2]["annos"]
