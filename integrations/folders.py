@@ -44,9 +44,10 @@ def export_mixture(
 ) -> int:
     """Write all samples of a mixture in an epoch; a rerun resumes an interrupted export.
 
-    Scans are numbered by their positions, in sequence 00 or in ``training``. ``mixture.csv`` lists
-    frame, domain and id of each, and the plan's hash. Scans for validation become sequence 08, or
-    follow the mixture's in ``training`` and are listed in ``ImageSets/val.txt``.
+    Scans are numbered by their positions, in sequence 00 or in ``training``, the first also in
+    ``testing``. ``mixture.csv`` lists frame, domain and id of each, and the plan's hash. Scans for
+    validation become sequence 08, or follow the mixture's in ``training`` and are listed in
+    ``ImageSets/val.txt``.
 
     Args:
         mixed: a mixture of scans, with ``to_sample=lambda scan, rng: scan``.
@@ -102,6 +103,9 @@ def export_mixture(
     ):
         scan = replace(held_out[number], id=f"validation {number}")
         written += _write(others, scan, first + number, camera)
+    if kitti:  # the converters of OpenPCDet and MMDetection3D need a test split
+        tests = KITTIObjectWriter(root, part="testing")
+        _write(tests, _sample(mixed, epoch, 0), 0, camera)
     writer.finish()
     if kitti and validation is not None:
         _write_split(root, "train", range(count))

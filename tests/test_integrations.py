@@ -308,6 +308,8 @@ def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:
     assert (root / "ImageSets" / "train.txt").read_text().split() == [
         f"{i:06d}" for i in range(5)
     ]
+    [test] = KITTIObject(root, "test")  # which trainers' converters need
+    assert np.array_equal(test.points, mixed[0].points)
     for i, scan in enumerate(KITTIObject(root, "train")):
         assert scan.boxes is not None and len(scan.boxes) == 2
         seen = in_view(mixed[i], CAMERA)

@@ -34,6 +34,7 @@ import pcdet
 import torch
 from layouts import write_all
 from lidar_synth.integrations.detection import write_gt_database
+from lidar_synth.integrations.folders import export_mixture
 from lidar_synth.integrations.openpcdet import register
 from pcdet.datasets import __all__ as registered
 from pcdet.datasets.kitti import kitti_dataset
@@ -46,6 +47,7 @@ from lidar_synth.formats import open_scans
 from lidar_synth.formats.calibration import in_view
 from lidar_synth.geometry.scan import Boxes
 from lidar_synth.labels import ObjectBank
+from lidar_synth.mixing import MixedScans
 
 REAL = 6
 EXTRA = 4
@@ -304,6 +306,18 @@ def test_a_database_of_any_source_is_drawn_from(made: Path, tmp_path: Path) -> N
         sample = dataset[position]
         boxes = Boxes(sample["gt_boxes"][:, :7], ("Car",) * len(sample["gt_boxes"]))
         assert held(boxes, sample["points"][:, :3]).min() >= 5
+
+
+def test_its_converter_reads_an_exported_mixture(made: Path, tmp_path: Path) -> None:
+    """Trap: it needs a test split before it makes the database of GT sampling."""
+    real, synth = open_scans(made / "kitti"), open_scans(made / "synthetic")
+    mixed = MixedScans(
+        real, synth, 0.4, "boxes", to_sample=lambda scan, rng: scan, epoch_size=5
+    )
+    export_mixture(mixed, tmp_path, "kitti", validation=real, progress=False)
+    create_kitti_infos(config(tmp_path, tmp_path), CLASSES, tmp_path, tmp_path, 1)
+    infos = pickle.loads((tmp_path / "kitti_infos_train.pkl").read_bytes())
+    assert len(infos) == 5 and (tmp_path / "kitti_dbinfos_train.pkl").is_file()
 
 
 def test_invalid_settings_are_refused(made: Path) -> None:
