@@ -20,7 +20,7 @@ from lidar_synth.files.disk import write_file
 from lidar_synth.formats import KITTIObject
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_object import OBJECT_CAMERA, KITTIObjectWriter
-from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
+from lidar_synth.formats.semantic_kitti import SPLITS, SemanticKITTIWriter
 from lidar_synth.formats.writer import Writer
 from lidar_synth.geometry import Scan, Source, identity_of, scan_hash
 from lidar_synth.mixing import MixedScans
@@ -44,10 +44,10 @@ def export_mixture(
 ) -> int:
     """Write all samples of a mixture in an epoch; a rerun resumes an interrupted export.
 
-    Scans are numbered by their positions, in sequence 00 or in ``training``, the first also in
-    ``testing``. ``mixture.csv`` lists frame, domain and id of each, and the plan's hash. Scans for
-    validation become sequence 08, or follow the mixture's in ``training`` and are listed in
-    ``ImageSets/val.txt``.
+    Scans are numbered by their positions, in sequence 00 (the others of the training are empty) or
+    in ``training``, the first also in ``testing``. ``mixture.csv`` lists frame, domain and id of
+    each, and the plan's hash. Scans for validation become sequence 08, or follow the mixture's in
+    ``training`` and are listed in ``ImageSets/val.txt``.
 
     Args:
         mixed: a mixture of scans, with ``to_sample=lambda scan, rng: scan``.
@@ -106,6 +106,10 @@ def export_mixture(
     if kitti:  # the converters of OpenPCDet and MMDetection3D need a test split
         tests = KITTIObjectWriter(root, part="testing")
         _write(tests, _sample(mixed, epoch, 0), 0, camera)
+    else:  # Pointcept, Open3D-ML and SPVNAS list the folder of each sequence
+        for sequence in SPLITS["train"] or ():
+            folder = root / "sequences" / sequence / "velodyne"
+            folder.mkdir(parents=True, exist_ok=True)
     writer.finish()
     if kitti and validation is not None:
         _write_split(root, "train", range(count))

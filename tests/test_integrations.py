@@ -330,6 +330,10 @@ def test_an_export_has_validation_apart_from_training(
     options = {"calibration": CAMERA, "validation": held, "progress": False}
     assert export_mixture(mixed, tmp_path / "out", layout, **options) == 7
     assert export_mixture(mixed, tmp_path / "out", layout, **options) == 0
+    if layout == "semantic_kitti":  # trainers list the folders of all sequences
+        folders = [tmp_path / "out" / "sequences" / f"{i:02d}" for i in range(11)]
+        counts = [len(list((each / "velodyne").iterdir())) for each in folders]
+        assert counts == [5, *[0] * 7, 2, 0, 0]
     with pytest.raises(ConfigError, match="was filled with .*validation"):
         others = {"validation": [street(i) for i in (8, 9)]}
         export_mixture(mixed, tmp_path / "out", layout, **options | others)

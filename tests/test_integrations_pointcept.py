@@ -49,6 +49,8 @@ from pointcept.utils.config import Config
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import open_scans
+from lidar_synth.integrations.folders import export_mixture
+from lidar_synth.mixing import MixedScans
 
 REAL = 6
 EXTRA = 4
@@ -282,6 +284,16 @@ def test_a_map_of_classes_that_does_not_fit_is_refused(
     )
     with pytest.raises(ConfigError, match="a map of classes with 10: 4"):
         build(made)
+
+
+def test_its_own_dataset_reads_an_exported_mixture(made: Path, tmp_path: Path) -> None:
+    """Trap: it lists all sequences, also those that the export does not have."""
+    real, synth = open_scans(made / "sk" / "dataset"), open_scans(made / "synthetic")
+    mixed = MixedScans(real, synth, epoch_size=5, to_sample=lambda scan, rng: scan)
+    export_mixture(mixed, tmp_path / "dataset", "semantic_kitti", progress=False)
+    stock = build(made, "SemanticKITTIDataset", stock=False, data_root=str(tmp_path))
+    assert len(stock) == 5
+    assert np.array_equal(stock[0]["coord"], mixed[0].points)
 
 
 def test_invalid_settings_are_refused(made: Path) -> None:
