@@ -1,5 +1,5 @@
 """Measure what an autoencoder preserves of a scan, by class: the figures of
-docs/research/autoencoder.md.
+docs/research/training.md.
 
     python tools/research/codec_card.py NAME=MODEL ... [--count 24]
 
