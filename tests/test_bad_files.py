@@ -324,7 +324,9 @@ def test_arrays_that_are_not_scans_are_refused(tmp_path: Path) -> None:
     np.savez(
         path, **{name: values for name, values in good.items() if name != "sensor"}
     )
-    with pytest.raises(DataError, match="it has no sensor"):
+    with pytest.raises(
+        DataError, match="scan.npz: it has no sensor: give one, --sensor"
+    ):
         open_scans(path)[0]
     assert len(open_scans(path, sensor="hdl64e_kitti")[0]) == len(scan)
     np.savez(path, points=good["points"], intensity=good["reflectance"])

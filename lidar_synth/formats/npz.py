@@ -272,7 +272,9 @@ def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, 
         "sensor": _sensor(arrays) if "sensor" in arrays else sensor
     }
     if known["sensor"] is None:
-        raise KeyError("it has no sensor: pass one")
+        raise ValueError(
+            "it has no sensor: give one, --sensor NAME|FILE.yaml (sensor=...)"
+        )
     for name, kinds in (("id", "U"), ("domain", "iu")):
         if name in arrays:
             if arrays[name].shape or arrays[name].dtype.kind not in kinds:
