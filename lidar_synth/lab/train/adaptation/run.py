@@ -205,7 +205,7 @@ def adapt(
             first, and which the autoencoder learns beside yours, so that it does not forget classes
             that yours lack; 0 = none.
         overrides: {name of a stage: values of its recipe}.
-        progress: show bars.
+        progress: show a bar while the scans are read; the trainings always show theirs.
         reading: further options of ``open_scans``.
 
     Returns:
