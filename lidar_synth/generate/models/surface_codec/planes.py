@@ -6,6 +6,8 @@ that what several patches show of one wall, or of one side of a vehicle, can be 
 """
 
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.generate.models.surface_codec.surfaces import Surfaces
@@ -17,6 +19,7 @@ REACH = (1, 3)
 TOLERANCE = 0.1
 """Standard deviation of the relative difference of inverse ranges between planes of one wall."""
 ROUNDS = 2
+_LEAST = 1e-6
 
 
 def share_planes(
@@ -33,41 +36,54 @@ def share_planes(
         grid: rows and columns of patches in an image; columns wrap around.
         patch: rows and columns of a patch.
     """
-    rows, columns = grid
     device = surfaces.inverse.device
     share, which = surfaces.weights.exp().mean(2).max(1)
     code = surfaces.classes.argmax(2).gather(1, which[:, None])[:, 0]
     kinds = torch.tensor([TRAIN_ID[name] for name in FLAT], device=device)
-    flat = torch.isin(code, kinds).nonzero()[:, 0]
-
-    steps = [torch.arange(-n, n + 1, device=device) for n in REACH]
-    down, across = torch.cartesian_prod(*steps).unbind(1)
-    row = flat[:, None] // columns % rows
-    column = flat[:, None] % columns
-    below = row + down
-    inside = below.clamp(0, rows - 1)
-    near = flat[:, None] + (inside - row) * columns
-    near = near + (column + across) % columns - column
-    counted = (inside == below) & (code[near] == code[flat, None])
+    flat = torch.isin(code, kinds)
+    which = which[:, None, None].expand(-1, 1, surfaces.inverse.shape[2])
+    inverse = surfaces.inverse.gather(1, which)[:, 0]
 
     # A plane is its inverse range in the middle of a patch and the changes by row and column.
-    ones = torch.ones_like(down)
-    offsets = torch.stack([ones, down * patch[0], across * patch[1]], 1).float()
     middles = [torch.arange(n, device=device) - (n - 1) / 2 for n in patch]
     cells = torch.cartesian_prod(torch.ones(1, device=device), *middles)
-    planes = surfaces.inverse.new_ones(len(share), 3)
-    planes[flat] = surfaces.inverse[flat, which[flat]] @ (cells / cells.square().sum(0))
+    planes = (inverse @ (cells / cells.square().sum(0))).mT.view(3, -1, *grid)
+    steps = [torch.arange(-n, n + 1, device=device) for n in REACH]
+    down, across = torch.cartesian_prod(*steps).T.view(2, -1, 1, 1, 1)
+    down, across = down * patch[0], across * patch[1]
+    code = code.view(-1, *grid)
+    counted = torch.where(flat, share, 0).view_as(code)
+    counted = _around(counted) * (_around(code) == code)
     for _ in range(ROUNDS):
-        own, others = planes[flat], planes[near]
-        ahead = own @ offsets.mT / others[..., 0]
-        back = (others * offsets.flip(0)).sum(2) / own[:, :1]
-        gap = ((ahead - 1).abs() + (back - 1).abs()) / (2 * TOLERANCE)
-        weight = share[near] * counted * (-(gap**2) / 2).exp()
-        weight = weight / weight.sum(1, keepdim=True)
-        own = (weight[..., None] * others).sum(1)
-        own[:, 0] -= (own * (weight @ offsets))[:, 1:].sum(1)
-        planes = planes.index_put((flat,), own)
-    shared = planes[flat] @ cells.mT
-    shared = shared.maximum(0.05 * planes[flat, :1])
-    inverse = surfaces.inverse.index_put((flat, which[flat]), shared)
-    return surfaces._replace(inverse=inverse)
+        far, tilt, turn = _around(planes).unbind(1)
+        ahead = planes[0] + planes[1] * down + planes[2] * across
+        back = far - tilt * down - turn * across
+        # outside the image, far is 0 and nothing is counted
+        gap = (ahead / far.clamp_min(_LEAST) - 1).abs() + (back / planes[0] - 1).abs()
+        weight = counted * (-((gap / (2 * TOLERANCE)) ** 2) / 2).exp()
+        weight = weight / weight.sum(0).clamp_min(_LEAST)
+        slopes = [(weight * tilt).sum(0), (weight * turn).sum(0)]
+        middle = weight * (far - slopes[0] * down - slopes[1] * across)
+        mean = torch.stack([middle.sum(0), *slopes])
+        planes = torch.where(flat.view_as(code), mean, planes)
+    shared = planes.flatten(1).mT @ cells.mT
+    shared = shared.maximum(0.05 * inverse)
+    shared = torch.where(flat[:, None], shared, inverse)
+    return surfaces._replace(
+        inverse=surfaces.inverse.scatter(1, which, shared[:, None])
+    )
+
+
+def _around(maps: Tensor) -> Tensor:
+    """(n, ..., h, w) values of the patches around each of (..., h, w), 0 outside of the rows."""
+    h, w = maps.shape[-2:]
+    down, across = REACH
+    columns = torch.arange(-across, w + across, device=maps.device) % w
+    wide = F.pad(maps[..., columns], (0, 0, down, down))
+    return torch.stack(
+        [
+            wide[..., i : i + h, j : j + w]
+            for i in range(2 * down + 1)
+            for j in range(2 * across + 1)
+        ]
+    )
