@@ -26,12 +26,13 @@ def surfaces(inverse: Tensor, kinds: Tensor) -> Surfaces:
     return Surfaces(both, zero[..., :1] + 0.01, zero, reflectance, classes, weights)
 
 
-def wall(slope: float = 0.002) -> Tensor:
-    """(48, 16) inverse ranges of a plane that is 10 m away in the first column; 1 / m."""
+def wall(slope: float = 0.0005) -> Tensor:
+    """(48, 16) inverse ranges, 1 / m, of a plane that changes by ``slope`` from column to column,
+    so that there is a step where the columns wrap around."""
     rows, columns = GRID
     i = torch.arange(rows * PATCH[0]).float()[:, None]
     j = torch.arange(columns * PATCH[1]).float()
-    image = 0.1 + 0.001 * i + slope * (j - j.mean()).abs() / 8
+    image = 0.06 + 0.001 * i + slope * j
     tiles = image.view(rows, PATCH[0], columns, PATCH[1]).transpose(1, 2)
     return tiles.reshape(rows * columns, -1)
 
@@ -42,15 +43,14 @@ def of_class(name: str) -> Tensor:
 
 
 def test_a_plane_stays_as_it_is() -> None:
-    flat = wall(slope=0)
-    before = surfaces(flat, of_class("building"))
+    before = surfaces(wall(), of_class("building"))
     torch.testing.assert_close(
         share_planes(before, GRID, PATCH).inverse, before.inverse
     )
 
 
 def test_errors_of_patches_are_averaged() -> None:
-    true = wall(slope=0)
+    true = wall()
     error = 0.03 * torch.randn(len(true), 1, generator=torch.Generator().manual_seed(0))
     shared = share_planes(
         surfaces(true * (1 + error), of_class("building")), GRID, PATCH

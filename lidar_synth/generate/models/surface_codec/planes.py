@@ -52,8 +52,7 @@ def share_planes(
     down, across = torch.cartesian_prod(*steps).T.view(2, -1, 1, 1, 1)
     down, across = down * patch[0], across * patch[1]
     code = code.view(-1, *grid)
-    counted = torch.where(flat, share, 0).view_as(code)
-    counted = _around(counted) * (_around(code) == code)
+    counted = _around(share.view_as(code)) * (_around(code) == code)
     for _ in range(ROUNDS):
         far, tilt, turn = _around(planes).unbind(1)
         ahead = planes[0] + planes[1] * down + planes[2] * across
