@@ -18,7 +18,7 @@ from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.town import Town
 from lidar_synth.labels import Object, objects_of, paste
 from lidar_synth.labels.merge import merge_scans
-from lidar_synth.labels.pasting import LIFT
+from lidar_synth.labels.pasting import LIFT, paste_groups
 
 places = st.tuples(st.floats(5, 30), st.floats(-180, 180), st.floats(-3.1, 3.1))
 
@@ -130,11 +130,31 @@ def test_an_object_is_not_placed_without_suitable_ground() -> None:
             ground=-HEIGHT - LIFT - 0.2
         ),  # on ground so low that it would be seen from above
         cast()[cast().points[:, 0] < 5],  # on ground that nobody has seen
+        cast()[cast().points[:, 0] < 12],  # with ground on one side only
+        replace(
+            cast(), boxes=cast([car(12, 1)]).boxes
+        ),  # in a box that nobody has seen
         cast()[:0],
     ):
         pasted = paste(host, [candidate])
         assert np.array_equal(pasted.points, host.points)
         assert pasted.boxes is not None and len(pasted.boxes) == len(host.boxes or ())
+
+
+def test_each_group_of_objects_has_a_number_of_its_own() -> None:
+    groups = [[seen(car(10, y)) for y in (y, y + 4)] for y in (-8, 0)]
+    pasted = paste_groups(cast(), [(group, 1) for group in groups], 5)
+    assert pasted.boxes is not None
+    assert sorted(pasted.boxes.values[:, 1].round().tolist()) == [-8, 0]
+
+
+def test_a_raised_object_has_the_rings_that_see_it() -> None:
+    host = cast(ground=-1.4)
+    candidate = seen(car(12, 3))
+    scans = (replace(s, ring=assign_beams(s).ring) for s in (host, candidate.scan))
+    pasted = paste(next(scans), [candidate._replace(scan=next(scans))])
+    new = pasted[pasted.instance == 1]
+    assert len(new) > 100 and np.array_equal(new.ring, assign_beams(new).ring)
 
 
 def test_objects_in_front_occlude_a_pasted_object() -> None:

@@ -98,6 +98,12 @@ def test_the_order_is_the_same_in_all_versions() -> None:
     assert " ".join(f"{'rabc'[source]}{index}" for source, index in order) == (
         "c1 r5 b0 r0 c0 r4 a0 r3 c2 r2 b1 r1"
     )
+    alike = replace(mixture(ratio=0.2, balanced=True), real=(PlannedSource(4),) * 2)
+    orders = (zip(*MixingPlan(alike, n).at(np.arange(10)), strict=True) for n in (0, 1))
+    assert [" ".join(f"{'abs'[s]}{i}" for s, i in order) for order in orders] == [
+        "s0 a2 b0 b1 a3 s1 a1 a0 b3 b2",
+        "s2 b3 b0 b2 a2 s3 b1 a0 a3 a1",
+    ]
 
 
 @settings(max_examples=60)
@@ -467,6 +473,13 @@ def test_the_hash_tells_plans_apart() -> None:
     ]
     assert one == MixingPlan(mixture(), 0).hash
     assert len({one, *(other.hash for other in others)}) == 6
+    # The largest number of an epoch to come determines which scans are used again.
+    growing = ({0: 0.25, 3: share} for share in (0.25, 0.5))
+    same, longer = (
+        MixingPlan(mixture(ratio=ratio, reuse=2, epoch_size=8), 2) for ratio in growing
+    )
+    assert same.counts == longer.counts and rows(same) != rows(longer)
+    assert same.hash != longer.hash
 
 
 @pytest.mark.parametrize("batch", [1, 2, 3])

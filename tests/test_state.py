@@ -77,6 +77,9 @@ def test_a_state_survives_json_and_fits_its_mixture(
 def test_a_state_without_its_plan(make: Callable[[MixedScans], Any]) -> None:
     with pytest.raises(ConfigError, match="the hash of the plan"):
         make(mixed()).load_state_dict({"seed": 0, "epoch": 3, "position": 0})
+    for wrong in ({"position": -1}, {"epoch": -1}, {"position": 1.0}):
+        with pytest.raises(ConfigError, match="integers of 0 or more"):
+            make(mixed()).load_state_dict(make_state(mixed().mixture, 0, 8) | wrong)
 
 
 @WAYS
@@ -111,6 +114,7 @@ def test_the_last_epoch_of_a_schedule_ends_where_it_ends() -> None:
     train.set_epoch(1)
     state = train.batches(4).state_dict(6)
     assert (state["epoch"], state["position"]) == (1, 24)
+    train.batches(4).load_state_dict(state)
 
 
 def test_the_next_epochs_ratio_may_change() -> None:
