@@ -74,7 +74,7 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
         )
     divided.divide(accelerator.process_index, accelerator.num_processes)
     if isinstance(divided, MixedBatches):
-        vars(divided).update(sampler=_KeepEpoch())
+        vars(divided).update(sampler=_KeepEpoch(), watched=False)
     prepared = prepare_data_loader(
         loader,
         accelerator.device,

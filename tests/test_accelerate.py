@@ -4,6 +4,7 @@ sample once."""
 import itertools
 import os
 import socket
+import warnings
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,7 @@ def run(rank: int, port: int) -> None:
     try:
         assert accelerator.num_processes == 2
         check_prepared(accelerator)
+        check_skipped(accelerator)
         check_metrics(accelerator)
         check_refusals(accelerator)
         check_unprepared(accelerator)
@@ -113,6 +115,16 @@ def check_prepared(accelerator: Any) -> None:
             assert seen(loader) == Counter(planned(2))
             loader.set_epoch(6)
             assert seen(loader) == Counter(planned(6))
+
+
+def check_skipped(accelerator: Any) -> None:
+    """Trap: batches that are left out look as if they were for another process."""
+    loader = prepare(accelerator, batched(mixed(), 0))
+    assert seen(accelerator.skip_first_batches(loader, 3)) == Counter(planned(0, 24))
+    loader.set_epoch(1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert seen(loader) == Counter(planned(1))
 
 
 def check_metrics(accelerator: Any) -> None:
