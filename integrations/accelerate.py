@@ -17,6 +17,7 @@ samples once. Resume by ``load_state_dict``; ``state_dict`` does not know of the
 """
 
 from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 from torch.utils.data import DataLoader
@@ -74,7 +75,10 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
         )
     divided.divide(accelerator.process_index, accelerator.num_processes)
     if isinstance(divided, MixedBatches):
-        vars(divided).update(sampler=_KeepEpoch(), watched=False)
+        # Where batches are skipped, Accelerate sets the epoch of a batch sampler's sampler instead
+        # of the dataset's; its earlier releases count from 0 there.
+        kept = SimpleNamespace(set_epoch=lambda epoch: None)
+        vars(divided).update(sampler=kept)
     prepared = prepare_data_loader(
         loader,
         accelerator.device,
@@ -88,14 +92,6 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
         state_dict=shard.state_dict, load_state_dict=shard.load_state_dict
     )
     return shard
-
-
-class _KeepEpoch:
-    """A batch sampler's sampler, whose epoch Accelerate sets instead of the dataset's where batches
-    are skipped: its earlier releases count from 0 there."""
-
-    def set_epoch(self, epoch: int) -> None:
-        """Leave the mixture in the epoch that was set or resumed."""
 
 
 class _Prepared(DataLoaderShard):  # type: ignore[misc]
@@ -114,6 +110,8 @@ class _Prepared(DataLoaderShard):  # type: ignore[misc]
         repeated."""
         super().begin()
         self.remainder = 0
+        # Batches that were skipped are none of another process, of which the sampler would warn.
+        vars(self._divided).update(_fetched=(0, 0))
 
     def __iter__(self) -> Iterator[Any]:
         epoch = self.iteration

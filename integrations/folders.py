@@ -96,16 +96,21 @@ def export_mixture(
         scan = _sample(mixed, epoch, position)
         rows.append(f"{position:06d},{scan.domain},{scan.id}")
         written += _write(writer, scan, position, camera)
-    first = count if kitti else 0
-    others = writer if kitti else SemanticKITTIWriter(root, sequence="08")
+    others, first = (
+        (writer, count) if kitti else (SemanticKITTIWriter(root, sequence="08"), 0)
+    )
     for number in tqdm(
         range(len(held_out)), "validation", unit="scan", disable=not progress
     ):
         scan = replace(held_out[number], id=f"validation {number}")
         written += _write(others, scan, first + number, camera)
     if kitti:  # the converters of OpenPCDet and MMDetection3D need a test split
-        tests = KITTIObjectWriter(root, part="testing")
-        _write(tests, _sample(mixed, epoch, 0), 0, camera)
+        _write(
+            KITTIObjectWriter(root, part="testing"),
+            _sample(mixed, epoch, 0),
+            0,
+            camera,
+        )
     else:  # Pointcept, Open3D-ML and SPVNAS list the folder of each sequence
         for sequence in SPLITS["train"] or ():
             folder = root / "sequences" / sequence / "velodyne"

@@ -135,8 +135,6 @@ class MixedBatches(Divided, Sampler[list[int]]):
     """
 
     call = "train.batches(...)"
-    watched = True
-    """Whether to warn where another library seems to divide the batches, too."""
 
     def __init__(
         self,
@@ -183,7 +181,7 @@ class MixedBatches(Divided, Sampler[list[int]]):
             self.dataset.current.warn(REPEATED.format(epoch))
         before, yielded = self._fetched
         fetched = self.dataset.current.fetched - before
-        if self.world_size > 1 and self.watched and 0 < fetched < yielded * 2 / 3:
+        if self.world_size > 1 and 0 < fetched < yielded * 2 / 3:
             warnings.warn(
                 SHARED_TWICE.format(yielded, self.rank, self.world_size, fetched),
                 stacklevel=2,
