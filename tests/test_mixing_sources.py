@@ -366,7 +366,11 @@ def batch_of(sample: Any) -> Any:
             DataError,
             r"labels \[40\]; expected train ids 0..18, or 255",
         ),
-        (lambda: wrong_labels(-1), DataError, r"labels \[-1\]; expected train ids"),
+        (
+            lambda: wrong_labels(-1),
+            DataError,
+            r"label holds -1.*train ids, 255 = ignore",
+        ),
         (
             lambda: MixedScans(None, Endless(), {0: 1.0, 3: 0.5}, epoch_size=4),
             DataError,

@@ -25,7 +25,8 @@ from lidar_synth.errors import (
     LibraryError,
     LidarSynthError,
 )
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.projection import project
+from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import presets
 
 TAXONOMIES = (SEMANTIC_KITTI, KITTI360, NUSCENES)
@@ -66,6 +67,42 @@ def test_points_become_float32() -> None:
     wide = replace(scan, points=scan.points.astype(np.float64))
     assert np.array_equal(wide.points, scan.points) and wide.points.dtype == np.float32
     assert replace(scan).points is scan.points
+
+
+def test_fields_get_their_types_without_a_copy_of_those_that_have_them() -> None:
+    scan = random_scan(presets()["vlp16"], 20)
+    half = scan.reflectance.astype(np.float16)
+    wide = replace(
+        scan,
+        reflectance=half,
+        label=scan.label.astype(np.int64),
+        pose=np.eye(4, dtype="f4"),
+    )
+    types = [a.dtype for a in (wide.reflectance, wide.label, wide.pose)]
+    assert types == [np.float32, np.uint8, np.float64]
+    assert np.array_equal(wide.reflectance, half)
+    assert project(wide).reflectance.dtype == np.float32
+    image = project(scan)
+    assert replace(scan).label is scan.label and replace(image).range is image.range
+    again = {
+        "label": image.label.astype(np.int64),
+        "mine": image.range.astype(np.float64),
+    }
+    again = RangeImage(image.range.astype(np.float64), image.sensor, again).channels
+    assert [a.dtype for a in again.values()] == [np.uint8, np.float64]
+    for field, wrong in (
+        ("label", -1),
+        ("ring", 70_000),
+        ("instance", 0.5),
+        ("pose", 1j),
+    ):
+        shape = (4, 4) if field == "pose" else len(scan)
+        with pytest.raises(DataError, match=f"{field} .*; expected .*numbers"):
+            replace(scan, **{field: np.full(shape, wrong)})
+    with pytest.raises(DataError, match="range image: label holds 300"):
+        RangeImage(
+            image.range, image.sensor, {"label": np.full(image.range.shape, 300)}
+        )
 
 
 def test_selecting_keeps_fields_together() -> None:

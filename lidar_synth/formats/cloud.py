@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError, parsing
 from lidar_synth.files.disk import SKIP_HINT, read_start
 from lidar_synth.formats.description import Description, from_comments
-from lidar_synth.formats.npz import TYPES
 from lidar_synth.geometry import Scan
+from lidar_synth.geometry.scan import TYPES
 
 STORED = {
     "label": "<u1",
@@ -251,19 +251,20 @@ def _first(
     return next((stored[name] for name in names if name in stored), None)
 
 
-def seconds(scan: Scan, where: Path) -> NDArray[np.float32] | None:
-    """The times of a scan as seconds from the first point, read in the largest unit in which a turn
+def seconds(
+    time: NDArray[Any], points: NDArray[np.float32], where: Path
+) -> NDArray[np.float32] | None:
+    """The times of points as seconds from the first point, read in the largest unit in which a turn
     is short; points that are not finite do not count.
 
     None if all points have one time, which is that of the file; with a warning, which names
     ``where``, if there is no such unit.
     """
-    assert scan.time is not None
-    own = scan.time[np.isfinite(scan.points).all(axis=1)]
+    own = time[np.isfinite(points).all(axis=1)]
     if not own.size or own.min() == own.max():
         return None
     with np.errstate(all="ignore"):
-        since: NDArray[np.float64] = (scan.time - own.min()).astype(np.float64)
+        since: NDArray[np.float64] = (time - own.min()).astype(np.float64)
         longest = np.float64(own.max() - own.min())
         for unit in UNITS:
             if longest * unit <= LONGEST_TURN:

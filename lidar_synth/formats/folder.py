@@ -92,23 +92,25 @@ class CloudFiles(ScanFiles):
             )
             arrays["reflectance"] = np.zeros(len(arrays["points"]), np.float32)
         if said is None:
-            arrays = {name: a for name, a in arrays.items() if name not in _OURS}
-        arrays["sensor"] = self._given or (said and said.sensor) or self.sensor
-        scan = Scan(**arrays)
-        scan = drop_empty_firings(scan) if said is None else said.origin.apply(scan)
-        if (ring := scan.ring) is not None:
+            arrays = drop_empty_firings(
+                {name: a for name, a in arrays.items() if name not in _OURS}
+            )
+        if (ring := arrays.get("ring")) is not None:
             with np.errstate(invalid="ignore"):
-                scan.ring = ring.astype(np.int16)
-            if not np.array_equal(scan.ring.clip(-32768 if said else 0), ring):
-                scan.ring = None
+                arrays["ring"] = ring.astype(np.int16)
+            if not np.array_equal(arrays["ring"].clip(-32768 if said else 0), ring):
+                del arrays["ring"]
                 warnings.warn(
                     f"the rings of the points in {path.parent} are ignored: some are no whole "
                     "numbers from 0 to 32767",
                     stacklevel=2,
                 )
-        if scan.time is not None and said is None:
-            scan.time = seconds(scan, path.parent)
-        scan.boxes = read_boxes(path)
+        if said is None and "time" in arrays:
+            arrays["time"] = seconds(arrays["time"], arrays["points"], path.parent)
+        sensor = self._given or (said and said.sensor) or self.sensor
+        scan = Scan(**arrays, sensor=sensor, boxes=read_boxes(path))
+        if said is not None:
+            scan = said.origin.apply(scan)
         is_log = said is None and scan.ring is not None
         scale = self._reflectance_max
         if scale is None:
@@ -239,13 +241,14 @@ def boxes_as_lists(boxes: Boxes) -> dict[str, list[Any]]:
     return {f.name: np.asarray(getattr(boxes, f.name)).tolist() for f in fields(Boxes)}
 
 
-def drop_empty_firings(scan: Scan) -> Scan:
-    """The scan without firings that had no return: points at the origin, and those of logs without
-    any coordinate."""
-    there = scan.points.any(axis=1)
-    if scan.ring is not None and scan.time is not None:
-        there &= ~np.isnan(scan.points).all(axis=1)
-    return scan if there.all() else scan[there]
+def drop_empty_firings(arrays: dict[str, Any]) -> dict[str, Any]:
+    """The arrays of a cloud without firings that had no return: points at the origin, and those of
+    logs without any coordinate."""
+    points = arrays["points"]
+    there = points.any(axis=1)
+    if {"ring", "time"} <= arrays.keys():
+        there &= ~np.isnan(points).all(axis=1)
+    return arrays if there.all() else {n: a[there] for n, a in arrays.items()}
 
 
 def rows_of_rings(scan: Scan) -> NDArray[np.int16]:

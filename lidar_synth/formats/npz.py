@@ -35,25 +35,13 @@ from lidar_synth.geometry import (
     RangeImage,
     Scan,
     Sensor,
+    to_types,
 )
 
 FACTS = ("sensor", "id", "domain", "provenance", "pose")
 """Names in a file that are not channels of a range image, like those that begin with ``BOX``."""
 
 BOX = "box_"
-
-TYPES = {
-    "points": "f4",
-    "reflectance": "f4",
-    "label": "u1",
-    "raw_label": "u4",
-    "instance": "i4",
-    "ring": "i2",
-    "confidence": "f4",
-    "time": "f4",
-    "cause": "u1",
-}
-"""numpy types of a scan's fields."""
 
 
 def read_stored_sensor(path: Path) -> Sensor | None:
@@ -65,47 +53,13 @@ def read_stored_sensor(path: Path) -> Sensor | None:
         return None  # reading the scan will raise the error
 
 
-def to_stored(
-    arrays: Mapping[str, NDArray[Any]], where: Path | str
-) -> dict[str, NDArray[Any]]:
-    """The arrays of a scan in the types of files; reflectances divided in numpy, for instance, are
-    float64.
-
-    Args:
-        arrays: points, or fields of ``TYPES``; others stay as they are.
-        where: the file, for errors.
-
-    Raises:
-        DataError: on integers that the type cannot hold, or no numbers.
-    """
-    result = {}
-    for name, values in arrays.items():
-        wanted = np.dtype(TYPES.get(name, values.dtype))
-        if values.dtype.kind not in "biuf":
-            raise DataError(f"{where}: {name} is {values.dtype}", "numbers")
-        # what overflows is refused below, or by ``check_scan``
-        with np.errstate(all="ignore"):
-            cast = np.ascontiguousarray(values, wanted)
-        if wanted.kind in "iu" and not np.array_equal(cast, values):
-            outside = values[cast != values].flat[0]
-            raise DataError(
-                f"{where}: {name} holds {outside}",
-                f"whole numbers that {wanted} can hold",
-            )
-        result[name] = cast
-    return result
-
-
 def write_scan(path: Path, scan: Scan) -> None:
     """Write a scan as ``.npz``; ``decode_scan`` is the inverse.
 
     Raises:
-        DataError: as ``to_stored``.
         FileError: if it cannot be written.
     """
-    write_arrays(
-        path, to_stored({"points": scan.points, **scan.fields()}, path) | _facts(scan)
-    )
+    write_arrays(path, {"points": scan.points, **scan.fields(), **_facts(scan)})
 
 
 def decode_scan(
@@ -120,13 +74,13 @@ def decode_scan(
 
     Raises:
         DataError: if points, reflectance or the sensor is missing, or has a wrong shape; as
-            ``to_stored``.
+            ``to_types``.
     """
     expected = "points, reflectance and sensor of a scan"
     if not {"points", "reflectance"} <= arrays.keys():
         raise DataError(f"{where} holds {shorten(', '.join(arrays), 100)}", expected)
-    known: dict[str, Any] = to_stored(
-        {n: a for n, a in arrays.items() if n in TYPES}, where
+    known: dict[str, Any] = to_types(
+        {n: a for n, a in arrays.items() if n in ("points", *POINT_FIELDS)}, where
     )
     with parsing(where, expected):
         facts = _known(arrays, sensor) | ({} if sensor is None else {"sensor": sensor})
@@ -146,8 +100,8 @@ def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -
         else _facts(scan, image.sensor)
     )
     arrays = {
-        "range": np.asarray(image.range, np.float32),
-        **to_stored(image.channels, path),
+        "range": image.range,
+        **image.channels,
         **facts,
     }
     write_arrays(path, arrays, compressed=True)
@@ -162,7 +116,7 @@ def decode_range_image(
     Raises:
         DataError: if range or sensor is missing, or a shape does not match the sensor.
     """
-    channels = to_stored(
+    channels = to_types(
         {
             n: a
             for n, a in arrays.items()
@@ -195,8 +149,7 @@ def range_image(
             ``RangeImage`` defines.
     """
     check_numbers(distance, f"{where}: range")
-    with np.errstate(over="ignore"):
-        image = RangeImage(distance.astype(np.float32, copy=False), sensor, channels)
+    image = RangeImage(distance, sensor, channels)
     bad = ~(np.isfinite(image.range) & (image.range >= 0))
     if bad.any():
         raise DataError(

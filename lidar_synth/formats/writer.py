@@ -40,7 +40,7 @@ from lidar_synth.formats.description import (
     record,
     require_grid,
 )
-from lidar_synth.formats.npz import check_pose, to_stored
+from lidar_synth.formats.npz import check_pose
 from lidar_synth.formats.points import check_scan, write_points
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry import POINT_FIELDS, REAL, SYNTHETIC, RangeImage, Scan
@@ -138,10 +138,7 @@ class Writer(ABC):
             require_grid(self.root, self._description, scan.sensor)
         where = f"scan {scan.id!r}"
         check_facts(scan, where)
-        typed: dict[str, Any] = to_stored(
-            {"points": scan.points, **scan.fields()}, where
-        )
-        scan = replace(scan, **typed)
+        scan = replace(scan)  # checks fields that were set since it was made, too
         check_scan(scan, where)
         picture = scan.image_path if image is None else image
         self._put(

@@ -19,6 +19,7 @@ from lidar_synth.geometry.scan import (
     require_reflectance,
     scan_hash,
     spread,
+    to_types,
     wrap_angle,
 )
 from lidar_synth.geometry.sensor import Sensor, load_sensor, presets, sensor_yaml
@@ -46,5 +47,6 @@ __all__ = [
     "scan_hash",
     "sensor_yaml",
     "spread",
+    "to_types",
     "wrap_angle",
 ]

@@ -204,6 +204,8 @@ class Boxes:
 class Scan:
     """One revolution of a LiDAR: N points in the sensor frame, their fields, boxes and pose.
 
+    Arrays of other types are converted to those below.
+
     Args:
         points: (N, 3) float32 x, y, z in metres.
         reflectance: (N,) float32 in [0, 1].
@@ -228,7 +230,7 @@ class Scan:
             values that were drawn; not written to files.
 
     Raises:
-        DataError: on shapes that do not match each other.
+        DataError: on shapes that do not match each other; as ``to_types``.
 
     Example:
         >>> import numpy as np
@@ -261,17 +263,18 @@ class Scan:
     augmented: tuple[Mapping[str, Mapping[str, Any]], ...] = ()
 
     def __post_init__(self) -> None:
-        self.points = np.asarray(self.points, np.float32)
+        where = f"scan {self.id!r}"
+        known = {n: a for n, a in vars(self).items() if n in TYPES and a is not None}
+        vars(self).update(to_types(known, where))
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise DataError(
-                f"scan {self.id!r}: points of shape {self.points.shape}",
+                f"{where}: points of shape {self.points.shape}",
                 "(N, 3): x, y, z in metres",
             )
-        for name in POINT_FIELDS:
-            values = getattr(self, name)
-            if values is not None and values.shape != (len(self),):
+        for name, values in self.fields().items():
+            if values.shape != (len(self),):
                 raise DataError(
-                    f"scan {self.id!r}: {name} has shape {values.shape}",
+                    f"{where}: {name} has shape {values.shape}",
                     f"({len(self)},), one per point",
                 )
 
@@ -306,17 +309,54 @@ class Scan:
         return replace(self, augmented=(*self.augmented, {name: drawn}))
 
 
-POINT_FIELDS = (
-    "reflectance",
-    "label",
-    "raw_label",
-    "instance",
-    "ring",
-    "confidence",
-    "time",
-    "cause",
-)
+TYPES = {
+    "points": "f4",
+    "range": "f4",
+    "pose": "f8",
+    "reflectance": "f4",
+    "label": "u1",
+    "raw_label": "u4",
+    "instance": "i4",
+    "ring": "i2",
+    "confidence": "f4",
+    "time": "f4",
+    "cause": "u1",
+}
+"""numpy types of the arrays of a ``Scan`` and a ``RangeImage``."""
+
+POINT_FIELDS = tuple(TYPES)[3:]
 """The fields of a ``Scan`` that hold one value per point, and of a ``RangeImage`` per cell."""
+
+
+def to_types(arrays: Mapping[str, Any], where: Path | str) -> dict[str, NDArray[Any]]:
+    """Arrays in their ``TYPES``; others, and those that have them, stay as they are.
+
+    Args:
+        arrays: by name; reflectances divided in numpy, for instance, are float64.
+        where: the scan or file, for errors.
+
+    Raises:
+        DataError: on integers that the type cannot hold, or no numbers.
+    """
+    result = {}
+    for name, given in arrays.items():
+        values = np.asarray(given)
+        wanted = np.dtype(TYPES.get(name, values.dtype))
+        if values.dtype.kind not in "biuf":
+            raise DataError(f"{where}: {name} is {values.dtype}", "numbers")
+        # what overflows is refused below, or where points and reflectance are checked
+        with np.errstate(all="ignore"):
+            cast = np.asarray(values, wanted)
+        whole = cast is values or wanted.kind == "f" or np.array_equal(cast, values)
+        if not whole:
+            outside = values[cast != values].flat[0]
+            raise DataError(
+                f"{where}: {name} holds {outside}",
+                f"whole numbers that {wanted} can hold",
+                "Labels are train ids, 255 = ignore." if name == "label" else "",
+            )
+        result[name] = cast
+    return result
 
 
 def model_provenance(name: str, checkpoint: str, seed: int) -> dict[str, Any]:
@@ -339,6 +379,8 @@ def model_provenance(name: str, checkpoint: str, seed: int) -> dict[str, Any]:
 class RangeImage:
     """A scan on the sensor's grid: at most one return per cell.
 
+    Arrays of other types are converted to those of a ``Scan``.
+
     Args:
         range: (H, W) float32 metres, Euclidean distance; 0 = no return.
         sensor: the sensor that defines the rows and columns.
@@ -348,7 +390,7 @@ class RangeImage:
         boxes: of the objects, which become those of the scan.
 
     Raises:
-        DataError: on a shape that is not the sensor's.
+        DataError: on a shape that is not the sensor's; as ``to_types``.
 
     Example:
         >>> import numpy as np
@@ -366,12 +408,15 @@ class RangeImage:
     boxes: Boxes | None = None
 
     def __post_init__(self) -> None:
-        for name, values in {"range": self.range, **self.channels}.items():
+        arrays = to_types({"range": self.range, **self.channels}, "range image")
+        for name, values in arrays.items():
             if values.shape != self.sensor.shape:
                 raise DataError(
                     f"range image: {name} has shape {values.shape}",
                     f"{self.sensor.shape}, the rows and columns of sensor {self.sensor.name!r}",
                 )
+        self.range = arrays.pop("range")
+        self.channels = arrays
 
     @property
     def mask(self) -> NDArray[np.bool_]:
