@@ -105,6 +105,14 @@ def test_fields_get_their_types_without_a_copy_of_those_that_have_them() -> None
         )
 
 
+def test_a_scan_equals_only_itself() -> None:
+    """Comparing arrays would be slow, and numpy's comparison has no truth value."""
+    scan = random_scan(presets()["vlp16"], 20)
+    scan.boxes = boxes(2)
+    for one in (scan, project(scan), scan.boxes):
+        assert one == one and one != copy.deepcopy(one) and one in {one}
+
+
 def test_selecting_keeps_fields_together() -> None:
     scan = random_scan(presets()["town"], 100)
     scan.boxes = boxes(2)

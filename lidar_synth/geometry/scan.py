@@ -41,7 +41,7 @@ def wrap_angle(angle: Any) -> Any:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-@dataclass
+@dataclass(eq=False)
 class Boxes:
     """Oriented 3-D boxes of one scan.
 
@@ -200,11 +200,12 @@ class Boxes:
         return inside
 
 
-@dataclass
+@dataclass(eq=False)
 class Scan:
     """One revolution of a LiDAR: N points in the sensor frame, their fields, boxes and pose.
 
-    Arrays of other types are converted to those below.
+    Arrays of other types are converted to those below. A scan equals only itself; ``scan_hash``
+    tells whether two have the same content.
 
     Args:
         points: (N, 3) float32 x, y, z in metres.
@@ -375,7 +376,7 @@ def model_provenance(name: str, checkpoint: str, seed: int) -> dict[str, Any]:
     }
 
 
-@dataclass
+@dataclass(eq=False)
 class RangeImage:
     """A scan on the sensor's grid: at most one return per cell.
 
