@@ -41,6 +41,7 @@ from pointcept_cpu import prepare
 prepare(ROOT)
 
 import lidar_synth.integrations.pointcept as adapter
+from lidar_synth.integrations.folders import export_mixture
 from pointcept.datasets.builder import build_dataset
 from pointcept.datasets.utils import point_collate_fn
 from pointcept.engines.hooks.builder import HOOKS
@@ -49,7 +50,6 @@ from pointcept.utils.config import Config
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import open_scans
-from lidar_synth.integrations.folders import export_mixture
 from lidar_synth.mixing import MixedScans
 
 REAL = 6
