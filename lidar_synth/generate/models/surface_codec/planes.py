@@ -45,8 +45,9 @@ def share_planes(
     inverse = surfaces.inverse.gather(1, which)[:, 0]
 
     # A plane is its inverse range in the middle of a patch and the changes by row and column.
-    middles = [torch.arange(n, device=device) - (n - 1) / 2 for n in patch]
-    cells = torch.cartesian_prod(torch.ones(1, device=device), *middles)
+    one = inverse.new_ones(1)
+    middles = [one.new_tensor(range(n)) - (n - 1) / 2 for n in patch]
+    cells = torch.cartesian_prod(one, *middles)
     planes = (inverse @ (cells / cells.square().sum(0))).mT.view(3, -1, *grid)
     steps = [torch.arange(-n, n + 1, device=device) for n in REACH]
     down, across = torch.cartesian_prod(*steps).T.view(2, -1, 1, 1, 1)
