@@ -144,8 +144,9 @@ def test_a_list_without_kittis_camera_is_taken(
 
 def test_scans_in_nuscenes_form(tmp_path: Path) -> None:
     """Written in nuScenes' form and read by the reader of nuScenes, a scan is what it was."""
-    scan = street(0)
+    scan = replace(street(0), pose=np.eye(4))
     turned = as_nuscenes(scan)
+    assert turned.pose is None  # which is that of the other axes
     (tmp_path / "a.pcd.bin").write_bytes(five_values(turned).astype("<f4").tobytes())
     back = NuScenes(tmp_path, sensor=scan.sensor)[0]
     assert np.array_equal(back.points, scan.points) and np.array_equal(
@@ -210,6 +211,17 @@ def test_balanced_lists_hold_each_class_as_often(scans: Path, tmp_path: Path) ->
     entries = json.loads(path.read_text())["data_list"]
     labels = [e["instances"][0]["bbox_label_3d"] for e in entries if e["instances"]]
     assert sorted(labels) == [0, 0, 7, 7] and len(entries) == 8
+    # Other classes, and boxes without a return, are none to be balanced.
+    content = json.loads(listed.read_text())
+    one, other = (content["data_list"][i]["instances"][0] for i in (1, 2))
+    one["bbox_label_3d"] = -1
+    other |= {"bbox_label_3d": 3, "bbox_3d_isvalid": False}
+    listed.write_text(json.dumps(content))
+    settings = {"synthetic": scans, "ratio": 0.0}
+    where = {"data_root": tmp_path / "n", **WHERE}
+    path = write_infos(tmp_path / "m", listed, settings, balance=True, **where)
+    drawn = [e["sample_idx"] for e in json.loads(path.read_text())["data_list"]]
+    assert sorted(drawn) == [0, 3]
 
 
 def test_with_synthetic_scans_alone_real_ones_need_no_labels(

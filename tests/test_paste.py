@@ -10,15 +10,16 @@ from box_scenes import CAR, HEIGHT, SENSOR, WALL, car, cast, wall
 from hypothesis import assume, example, given, settings
 from pasting import assert_nothing_shares_a_ray
 
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.projection import locate, project
-from lidar_synth.geometry.scan import SYNTHETIC
+from lidar_synth.geometry.scan import SYNTHETIC, Boxes
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.town import Town
 from lidar_synth.labels import Object, objects_of, paste
 from lidar_synth.labels.merge import merge_scans
-from lidar_synth.labels.pasting import LIFT, paste_groups
+from lidar_synth.labels.pasting import LIFT, paste_groups, update_occlusion
 
 places = st.tuples(st.floats(5, 30), st.floats(-180, 180), st.floats(-3.1, 3.1))
 
@@ -213,16 +214,43 @@ def test_occluded_objects_are_removed_with_their_boxes() -> None:
     assert pasted.boxes is not None and pasted.instance is not None
     assert pasted.boxes.instance.tolist() == [2, 3, 4]
     assert not (pasted.instance == 1).any()
-    assert pasted.boxes.occlusion[0] == 0
+    assert pasted.boxes.occlusion.tolist() == [0, 1, -1]
     truth = cast([behind, beside, farther, car(12, 0, np.pi / 2)])
     assert truth.instance is not None and host.instance is not None
     assert 0 < (truth.instance == 3).sum() < (host.instance == 3).sum()
     left = (truth.instance == 3).sum()
     assert (pasted.instance == 3).sum() == left
+    equal = paste(host, [seen(car(12, 0, np.pi / 2))], least=left)
+    assert np.array_equal(equal.points, pasted.points)
     strict = paste(host, [seen(car(12, 0, np.pi / 2))], least=left + 1)
     assert strict.boxes is not None and np.allclose(strict.boxes.values[:, 0], [10, 12])
     assert (strict.label == CAR).sum() == (pasted.label == CAR).sum() - left
     assert_nothing_shares_a_ray(pasted, 4)
+
+
+def test_occlusion_only_grows_and_unknown_levels_stay() -> None:
+    boxes = Boxes(np.tile(car(9, 0), (9, 1)), ("Car",) * 9)
+    boxes = replace(boxes, occlusion=np.array([0, 0, 0, 0, 0, 0, 2, 3, -1]))
+    shares = np.array([1, 0.8, 0.79, 0.45, 0.44, 0, 0.6, 0.3, 0.3])
+    assert update_occlusion(boxes, shares).occlusion.tolist() == [
+        *[0, 0, 1, 1, 2, 2, 2, 3, 2]
+    ]
+
+
+def test_an_object_up_to_its_roof_hides_what_stands_higher_on_a_hill() -> None:
+    host = cast()
+    host.points[:, 2] += 0.1 * host.points[:, 0]
+    cars = (seen(car(x, 0, 0, z), z) for x, z in ((6, -1.13), (15, -0.23)))
+    pasted = paste(host, cars)
+    assert pasted.boxes is not None and len(pasted.boxes) == 1
+
+
+def test_ground_without_labels_does_not_hide_the_foot_of_an_object() -> None:
+    host = cast(ground=-2.3)
+    unknown = np.random.default_rng(0).random(len(host)) < 0.5
+    partly = replace(host, label=np.where(unknown, np.uint8(IGNORE), host.label))
+    known, found = (paste(h, [seen(car(22, 5, 0.4))]) for h in (host, partly))
+    assert np.array_equal(found.points, known.points)
 
 
 def test_pasted_objects_occlude_one_another_in_any_order() -> None:
@@ -361,6 +389,10 @@ def test_a_coarser_sensor_cannot_lend_objects() -> None:
     with pytest.raises(
         DataError, match="'hdl32e_nuscenes' for a scan of 'town'.* sensor='town'"
     ):
+        paste(cast(), [found])
+    wide = replace(SENSOR, name="wide", columns=SENSOR.columns // 2)
+    [found] = objects_of(cast([car(8, 3)], sensor=wide)).values()
+    with pytest.raises(DataError, match="'wide' for a scan of 'town'"):
         paste(cast(), [found])
     fine = paste(cast(sensor=coarse), [seen(car(8, 3))])
     assert fine.boxes is not None and len(fine.boxes) == 1
