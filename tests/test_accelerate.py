@@ -112,9 +112,13 @@ def check_prepared(accelerator: Any) -> None:
             assert seen(loader) == Counter(planned(7, 24))
             assert seen(loader) == Counter(planned(8))
             train.set_epoch(2)
+            state = loader.state_dict()
+            assert (state["epoch"], state["position"]) == (2, 0)
             assert seen(loader) == Counter(planned(2))
             loader.set_epoch(6)
             assert seen(loader) == Counter(planned(6))
+            loader.load_state_dict(make_state(train.mixture, 6, 8))
+            assert loader.state_dict()["position"] == 8
 
 
 def check_skipped(accelerator: Any) -> None:

@@ -341,6 +341,9 @@ def test_a_paged_bank_reads_over_a_network(tmp_path: Path) -> None:
     import fsspec
 
     write_bank(tmp_path / "bank", [some_image(i) for i in range(3)], layout="paged")
+    with h5py.File(tmp_path / "bank" / "shard-00000.h5") as file:
+        strategy, *_ = file.id.get_create_plist().get_file_space_strategy()
+        assert strategy == h5py.h5f.FSPACE_STRATEGY_PAGE
     store = fsspec.filesystem("memory")
     store.put(str(tmp_path / "bank"), "/remote", recursive=True)
     scans = open_scans("memory://remote")

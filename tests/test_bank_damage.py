@@ -219,6 +219,19 @@ def test_invalid_codes_are_refused_despite_a_matching_checksum(
         shard.read(0)
 
 
+def test_a_scan_at_the_place_of_another_is_refused(tmp_path: Path) -> None:
+    [path] = write_bank(tmp_path, [some_image()], fields=())
+    with h5py.File(path, "r+") as file:
+        file["index"][0] = 5
+        arrays = {"range": np.ascontiguousarray(file["range"][0])}
+        file["crc"][0] = checksum(int(file["seed"][0]), 5, arrays)
+    with (
+        ShardReader(path, "the shard") as shard,
+        pytest.raises(DataError, match="it is scan 5 of seed"),
+    ):
+        shard.read(0)
+
+
 def test_a_number_in_place_of_text_allocates_no_memory(tmp_path: Path) -> None:
     """bytes(2**40) would be a terabyte of zeros."""
     [path] = write_bank(tmp_path, [some_image()])

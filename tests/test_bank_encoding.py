@@ -12,12 +12,13 @@ from banks import SENSOR, some_image, spoiled
 from hypothesis import given, settings
 
 from lidar_synth.bank import Encoding
+from lidar_synth.bank.boxes import check_boxes, encode_boxes
 from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
 from lidar_synth.bank.encoding import LEVELS, TYPES
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import RangeImage
+from lidar_synth.geometry.scan import Boxes, RangeImage
 from lidar_synth.geometry.sensor import Sensor
 
 ALL = ("reflectance", "label", "confidence")
@@ -98,6 +99,35 @@ def test_codes_and_checksums_match_the_format() -> None:
         bytes.fromhex(content[0]) + b"seq/0001" + bytes.fromhex(content[1])
     )
     assert checksum(7, 2**40, arrays, b"seq/0001") == expected
+
+
+BOX = np.array([[1.5, -2, -0.25, 4, 1e-5, 1.5, -1.25]], np.float32)
+
+
+def test_codes_of_boxes_match_the_format() -> None:
+    rows = encode_boxes(Boxes(BOX, ("Van",), instance=np.array([7])))
+    assert rows.shape == (256, 9) and not rows[1:].any()
+    expected = [2, 7, 15000, -20000, -2500, 40000, 1, 15000, -125000]
+    assert rows[0].tolist() == expected
+    check_boxes(rows)
+    with pytest.raises(DataError, match="boxes without instance"):
+        encode_boxes(Boxes(BOX, ("Van",)))
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "code"),
+    [
+        *((0, 0, 12), (0, 0, -1), (0, 1, 0), (0, 5, 0), (0, 6, 0), (0, 7, -1)),
+        *((1, 3, 5), (2, 0, 1)),
+    ],
+)
+def test_codes_of_boxes_that_are_never_written_are_refused(
+    row: int, column: int, code: int
+) -> None:
+    rows = encode_boxes(Boxes(BOX, ("Van",), instance=np.array([7])))
+    rows[row, column] = code
+    with pytest.raises(DataError, match="boxes with"):
+        check_boxes(rows)
 
 
 def test_encoding_into_existing_arrays() -> None:

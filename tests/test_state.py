@@ -117,6 +117,17 @@ def test_the_last_epoch_of_a_schedule_ends_where_it_ends() -> None:
     train.batches(4).load_state_dict(state)
 
 
+def test_a_resumed_epoch_that_comes_again_after_another_is_whole() -> None:
+    train = mixed()
+    resumed = batches(train)
+    resumed.load_state_dict(make_state(train.mixture, 1, 8))
+    counts = []
+    for epoch in (1, 2, 1):
+        train.set_epoch(epoch)
+        counts.append(sum(map(len, resumed)))
+    assert counts == [8, 16, 16]
+
+
 def test_the_next_epochs_ratio_may_change() -> None:
     """What is still to come is not part of a state."""
     state = make_state(mixed(ratio=[0.25, 0.25], epoch_size=16).mixture, 0, 8)

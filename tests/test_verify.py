@@ -24,7 +24,7 @@ from lidar_synth.bake.edit import head, merge, split
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.making import NOTE
 from lidar_synth.bake.repair import repair
-from lidar_synth.bake.verify import AGREE, regenerate, verify
+from lidar_synth.bake.verify import AGREE, agreement, regenerate, verify
 from lidar_synth.bank import INDEX, Bank, Index
 from lidar_synth.bank.index import SETTINGS
 from lidar_synth.cli import app
@@ -422,6 +422,36 @@ def test_banks_beyond_repair_are_reported(root: Path, tmp_path: Path) -> None:
     shard.unlink()
     with pytest.raises(DataError, match="recorded scans, which no model makes again"):
         repair(tmp_path / "recorded", progress=False)
+
+
+def test_an_index_is_not_rebuilt_from_some_shards_of_a_bake_or_of_several(
+    root: Path, tmp_path: Path, model: Path
+) -> None:
+    """Else a part of a bank, or shards of two, would become a whole bake."""
+    part = tmp_path / "part"
+    head(Bank(root), 4, part, progress=False)
+    both = Path(shutil.copytree(root, tmp_path / "both"))
+    other = baked(tmp_path / "other", model, steps=2)
+    shutil.copyfile(other / "shard-00001.h5", both / "shard-00001.h5")
+    for name in ("shard-00002.h5", SETTINGS):
+        (root / name).unlink()
+    for folder, message in (
+        (part, "of different bakes"),
+        (both, "of different bakes"),
+        (root, "shard-00002.h5 is not there, nor .bake.json"),
+    ):
+        (folder / INDEX).unlink()
+        before = shards(folder)
+        with pytest.raises(DataError, match=f"{message}.*expected a copy of the index"):
+            repair(folder, str(model), progress=False)
+        assert shards(folder) == before and not (folder / INDEX).exists()
+
+
+def test_cells_with_other_labels_do_not_agree() -> None:
+    one, other = some_image(), some_image()
+    assert agreement(one, other) == 1
+    other.channels["label"][0, :4] = (other.channels["label"][0, :4] + 1) % 19
+    assert agreement(one, other) == 1 - 4 / one.range.size
 
 
 def test_a_repair_with_different_bytes_is_recorded(
