@@ -96,31 +96,31 @@ def export_mixture(
         scan = _sample(mixed, epoch, position)
         rows.append(f"{position:06d},{scan.domain},{scan.id}")
         written += _write(writer, scan, position, camera)
-    others, first = (
-        (writer, count) if kitti else (SemanticKITTIWriter(root, sequence="08"), 0)
-    )
+    first = count if kitti else 0
+    others = writer if kitti else SemanticKITTIWriter(root, sequence="08")
     for number in tqdm(
         range(len(held_out)), "validation", unit="scan", disable=not progress
     ):
         scan = replace(held_out[number], id=f"validation {number}")
         written += _write(others, scan, first + number, camera)
     if kitti:  # the converters of OpenPCDet and MMDetection3D need a test split
-        _write(
-            KITTIObjectWriter(root, part="testing"),
-            _sample(mixed, epoch, 0),
-            0,
-            camera,
-        )
-    else:  # Pointcept, Open3D-ML and SPVNAS list the folder of each sequence
-        for sequence in SPLITS["train"] or ():
-            folder = root / "sequences" / sequence / "velodyne"
-            folder.mkdir(parents=True, exist_ok=True)
+        tests = KITTIObjectWriter(root, part="testing")
+        _write(tests, _sample(mixed, epoch, 0), 0, camera)
+    else:
+        _add_sequences(root)
     writer.finish()
     if kitti and validation is not None:
         _write_split(root, "train", range(count))
         _write_split(root, "val", range(count, count + len(held_out)))
     write_file(root / MANIFEST, "".join(f"{row}\n" for row in rows).encode())
     return written
+
+
+def _add_sequences(root: Path) -> None:
+    """Make the folder of each training sequence: Pointcept, Open3D-ML and SPVNAS list them all."""
+    for sequence in SPLITS["train"] or ():
+        folder = root / "sequences" / sequence / "velodyne"
+        folder.mkdir(parents=True, exist_ok=True)
 
 
 def _write_split(root: Path, split: str, frames: range) -> None:
